@@ -1,0 +1,213 @@
+r"""The flat hybrid system that a diagram compiles to and that every integrator reads.
+
+A :class:`Dae` is
+
+.. math::
+    \dot x = f(t, x, z, u, p, q, c), \qquad
+    0 = g(t, x, z, u, p, q, c), \qquad
+    y = h(t, x, z, u, p, q, c)
+
+with states `x`, algebraic variables `z`, inputs `u`, parameters `p`, the flags `q` of the active modes and
+the clocks `c` (time since each automaton entered its mode). Inside a mode every function is smooth; all
+that is discrete stands in the automata, as data. Models build it, integrators read it; neither knows the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dcvrt.errors import InputError, did_you_mean
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One named scalar of the system.
+
+    `value` is the start value of a state or algebraic variable, the rest value of an input, the value of a
+    parameter, and is not used for outputs. `bounds` of a state is its range of validity: crossing it
+    is an event that ends the run with a status; of a parameter it is the range that may be set.
+    """
+
+    path: str
+    unit: str
+    value: float = 0.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    doc: str = ""
+    source: str = ""
+    crossing: str = ""
+    """What it means when a state leaves its bounds, for the status sentence ("DC link collapsed")."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Row of an automaton: from `source` to `target` once `guard` has been positive for longer than `held`.
+
+    `guard` and `held` are SX expressions of the system's own symbols (`held` of parameters only; 0 fires at
+    once). `reset` maps state positions to expressions of the values before the jump; other states are continuous.
+    """
+
+    source: str
+    target: str
+    guard: ca.SX
+    held: ca.SX
+    text: str
+    reset: Mapping[int, ca.SX] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Automaton:
+    """Modes, the flags each mode sets, and the rows that lead from one to another, tried top to bottom.
+
+    Attributes
+    ----------
+    path : path of the block that owns it.
+    modes, start : mode names and the one that a run starts in.
+    q : SX column of flag symbols that the equations read, one per row of `flag_names`.
+    flags : array (modes, flags): value of `q` in each mode.
+    clock : SX symbol, time since the current mode was entered.
+    rows : transitions in order.
+    """
+
+    path: str
+    modes: tuple[str, ...]
+    start: str
+    q: ca.SX
+    flag_names: tuple[str, ...]
+    flags: Array
+    clock: ca.SX
+    rows: tuple[Transition, ...]
+
+    def mode_number(self, mode: str) -> int:
+        """Position of `mode` in `modes`."""
+        if mode not in self.modes:
+            raise InputError(f"{self.path} has no mode {mode!r}.{did_you_mean(mode, self.modes)}")
+        return self.modes.index(mode)
+
+
+@dataclass(frozen=True, eq=False)
+class Dae:
+    """Flat hybrid differential-algebraic system, frozen.
+
+    Attributes
+    ----------
+    name : name of the diagram.
+    t : SX symbol of time, s.
+    x, z, u, p : SX columns of symbols, in the order of `states`, `algebraics`, `inputs`, `parameters`.
+    f, g, y : SX columns: derivative of x, residual of z, outputs in the order of `outputs`.
+    states, algebraics, inputs, parameters, outputs : their named rows.
+    automata : the discrete parts; empty for a smooth system.
+    start : SX column of `x` then `z`, start values as functions of `p` and `u` for the search of the
+        equilibrium (a guess, not the equilibrium itself).
+    notes : deviations from the paper, one line each ('path: text').
+    """
+
+    name: str
+    t: ca.SX
+    x: ca.SX
+    z: ca.SX
+    u: ca.SX
+    p: ca.SX
+    f: ca.SX
+    g: ca.SX
+    y: ca.SX
+    states: tuple[Row, ...]
+    algebraics: tuple[Row, ...]
+    inputs: tuple[Row, ...]
+    parameter_rows: tuple[Row, ...]
+    outputs: tuple[Row, ...]
+    automata: tuple[Automaton, ...] = ()
+    start: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    notes: tuple[str, ...] = ()
+
+    @property
+    def parameters(self) -> ParameterTable:
+        """Path, value, unit, bounds, meaning and source of every parameter, printable."""
+        return ParameterTable(self.parameter_rows)
+
+    @property
+    def q(self) -> ca.SX:
+        """Flags of all automata, stacked."""
+        return ca.vertcat(*[a.q for a in self.automata]) if self.automata else ca.SX(0, 1)
+
+    @property
+    def clocks(self) -> ca.SX:
+        """Clocks of all automata, stacked."""
+        return ca.vertcat(*[a.clock for a in self.automata]) if self.automata else ca.SX(0, 1)
+
+    @property
+    def x_names(self) -> tuple[str, ...]:
+        return tuple(r.path for r in self.states)
+
+    @property
+    def p_names(self) -> tuple[str, ...]:
+        return tuple(r.path for r in self.parameter_rows)
+
+    @property
+    def u_names(self) -> tuple[str, ...]:
+        return tuple(r.path for r in self.inputs)
+
+    @property
+    def y_names(self) -> tuple[str, ...]:
+        return tuple(r.path for r in self.outputs)
+
+    def parameter_number(self, path: str) -> int:
+        """Position of the parameter `path` in `p`."""
+        if path not in self.p_names:
+            raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
+        return self.p_names.index(path)
+
+    def output_number(self, path: str) -> int:
+        """Position of the output `path` in `y`."""
+        if path not in self.y_names:
+            raise InputError(f"{self.name} has no output {path!r}.{did_you_mean(path, self.y_names)}")
+        return self.y_names.index(path)
+
+    def parameter_values(self, **changes: float) -> Array:
+        """Values of `p` with some changed; each change is checked against its bounds.
+
+        A path `block.symbol` is given as keyword through ``**{"block.symbol": value}``.
+
+        Raises
+        ------
+        InputError
+            unknown names and values outside their bounds, all at once.
+        """
+        values = np.array([r.value for r in self.parameter_rows], dtype=float)
+        problems = []
+        for path, value in changes.items():
+            if path not in self.p_names:
+                problems.append(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
+                continue
+            row = self.parameter_rows[self.p_names.index(path)]
+            low, high = row.bounds
+            if not low <= value <= high:
+                problems.append(f"{path} = {value:g} {row.unit} is outside [{low:g}, {high:g}].")
+                continue
+            values[self.p_names.index(path)] = value
+        if problems:
+            raise InputError("\n".join(problems))
+        return values
+
+
+class ParameterTable(tuple[Row, ...]):
+    """Rows of parameters that print as a table."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        cells = [("parameter", "value", "unit", "bounds", "meaning", "source")]
+        cells += [
+            (r.path, f"{r.value:g}", r.unit, f"[{r.bounds[0]:g}, {r.bounds[1]:g}]", r.doc, r.source) for r in self
+        ]
+        widths = [max(len(row[k]) for row in cells) for k in range(4)]
+        return "\n".join(
+            "  ".join([c.ljust(w) for c, w in zip(row, widths, strict=False)] + [row[4], row[5]]).rstrip()
+            for row in cells
+        )

@@ -1,0 +1,56 @@
+"""The kinds of error that dcvrt raises. Each message says what is wrong, where, and the way out."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class DcvrtError(Exception):
+    """Base of every error that dcvrt raises on purpose."""
+
+
+class InputError(DcvrtError, ValueError):
+    """What the user gave cannot be used: a value, a name, a file."""
+
+
+class ModelError(DcvrtError, ValueError):
+    """A block, a diagram or an automaton is not well formed."""
+
+
+class SimulationError(DcvrtError, RuntimeError):
+    """A simulation ended without a result; the message is the status sentence."""
+
+
+class InfeasibleError(DcvrtError, ValueError):
+    """The question has no answer: no capacity meets the limits even before any is hosted."""
+
+
+def did_you_mean(name: object, known: Iterable[object]) -> str:
+    """Say which known name is nearest, or list the first of them.
+
+    >>> did_you_mean("Kp", ["K_p", "K_i"])
+    " Did you mean 'K_p'? Known: K_p, K_i."
+    >>> did_you_mean("zzz", [])
+    ''
+    """
+    names = [str(k) for k in known]
+    if not names:
+        return ""
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    return f"{hint} Known: {listed}."
+
+
+def raise_all(problems: list[str], where: str, kind: type[DcvrtError] = InputError) -> None:
+    """Raise one error that lists every problem found, or return when there is none.
+
+    >>> raise_all([], "study.toml")
+    """
+    if not problems:
+        return
+    if len(problems) == 1:
+        raise kind(f"{where}: {problems[0]}")
+    lines = "\n".join(f"  {problem}" for problem in problems)
+    raise kind(f"{where}: {len(problems)} problems\n{lines}")
