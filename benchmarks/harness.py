@@ -1,0 +1,79 @@
+"""What every benchmark shares: the row it reports, the clock it uses, and how rows are printed and stored.
+
+A benchmark is a module of this package with one function ``run(smoke: bool) -> list[Result]``. Ratios are
+quoted, absolute times are not: they belong to the machine.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypedDict
+
+
+class Result(TypedDict):
+    """One row: ours beside a baseline. `ratio` = baseline_value / value; `error` is the accuracy both were held to."""
+
+    case: str
+    metric: str
+    value: float
+    unit: str
+    baseline: str
+    baseline_value: float | None
+    ratio: float | None
+    error: float | None
+
+
+def result(
+    case: str,
+    metric: str,
+    value: float,
+    unit: str,
+    baseline: str = "",
+    baseline_value: float | None = None,
+    error: float | None = None,
+) -> Result:
+    """Make a row; the ratio follows from the two values."""
+    ratio = baseline_value / value if baseline_value is not None and value > 0 else None
+    return Result(
+        case=case,
+        metric=metric,
+        value=value,
+        unit=unit,
+        baseline=baseline,
+        baseline_value=baseline_value,
+        ratio=ratio,
+        error=error,
+    )
+
+
+def seconds(call: Callable[[], Any], repeats: int = 5) -> float:
+    """Least wall time of `repeats` calls, s, after one call that warms caches."""
+    call()
+    best = float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def table(rows: Sequence[Result]) -> str:
+    """Rows as aligned text."""
+    columns = ("case", "metric", "value", "unit", "baseline", "baseline_value", "ratio", "error")
+    cells = [columns, *(tuple(_text(row[c]) for c in columns) for row in rows)]  # type: ignore[literal-required]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(columns))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def write_json(rows: Sequence[Result], path: str | Path) -> None:
+    """Store rows as a JSON list."""
+    Path(path).write_text(json.dumps(list(rows), indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,294 @@
+"""Block: parameters, ports and states declared once by name, equations given once.
+
+The same `equations` run on numbers (in tests, by hand) and on CasADi symbols (when a diagram compiles).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf
+from types import SimpleNamespace
+from typing import Any, ClassVar, TypeVar
+
+import casadi as ca
+
+from dcvrt.errors import InputError, ModelError, did_you_mean, raise_all
+from dcvrt.models.automaton import Go
+from dcvrt.models.phasor import Phasor, Scalar
+from dcvrt.units import dimension
+
+
+class UnknownName(ModelError, AttributeError):
+    """A symbol or port that the block does not declare."""
+
+
+@dataclass
+class Declared:
+    """Something that a block declares by name."""
+
+    name: str = field(default="", init=False)
+    unit: str = ""
+    doc: str = ""
+    kind: type = field(default=float, kw_only=True)
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, block: Block | None, owner: type | None = None) -> Any:
+        return self if block is None else Port(block, self)
+
+
+@dataclass
+class Parameter(Declared):
+    """A constant of the block: value, unit, range it may be set in, meaning, and where the value comes from."""
+
+    value: float = 0.0
+    bounds: tuple[float, float] = (-inf, inf)
+    source: str = "not stated"
+
+    def __init__(
+        self,
+        value: float,
+        unit: str,
+        bounds: tuple[float, float] = (-inf, inf),
+        doc: str = "",
+        source: str = "not stated",
+    ) -> None:
+        self.name, self.unit, self.doc, self.kind = "", unit, doc, float
+        self.value, self.bounds, self.source = float(value), bounds, source
+
+    def __get__(self, block: Block | None, owner: type | None = None) -> Any:
+        return self if block is None else block.values[self.name]
+
+
+@dataclass
+class Input(Declared):
+    """A signal that another block, or the diagram, must feed."""
+
+
+@dataclass
+class Output(Declared):
+    """A signal that the block computes."""
+
+
+@dataclass
+class State(Declared):
+    """A variable with a derivative.
+
+    `start` is the value that the search of the equilibrium begins with, unless the block's `rest` gives a
+    better one. `bounds` is the range in which the equations are valid, `crossing` what it means to leave it.
+    """
+
+    start: float = 0.0
+    bounds: tuple[float, float] = (-inf, inf)
+    crossing: str = ""
+
+    def __init__(
+        self,
+        start: float,
+        unit: str,
+        doc: str = "",
+        bounds: tuple[float, float] = (-inf, inf),
+        crossing: str = "",
+    ) -> None:
+        self.name, self.unit, self.doc, self.kind = "", unit, doc, float
+        self.start, self.bounds, self.crossing = float(start), bounds, crossing
+
+
+@dataclass
+class Algebraic(Declared):
+    """A variable defined by an equation 0 = residual."""
+
+    start: float = 0.0
+
+    def __init__(self, start: float, unit: str, doc: str = "") -> None:
+        self.name, self.unit, self.doc, self.kind, self.start = "", unit, doc, float, float(start)
+
+
+@dataclass(frozen=True)
+class Port:
+    """One named signal of one block, as `connect` takes it."""
+
+    block: Any
+    declared: Declared
+
+    def __str__(self) -> str:
+        owner = self.block.name or type(self.block).__name__
+        return f"{owner}.{self.declared.name}"
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable."""
+
+    der: Mapping[str, Scalar] = field(default_factory=dict)
+    out: Mapping[str, Scalar | Phasor] = field(default_factory=dict)
+    alg: Mapping[str, Scalar] = field(default_factory=dict)
+
+
+class Namespace(SimpleNamespace):
+    """The symbols, or numbers, that a block's equations see as `s`."""
+
+    def __getattr__(self, name: str) -> Any:
+        known = [k for k in vars(self) if not k.startswith("_")]
+        raise UnknownName(f"{self._owner} has no symbol or value {name!r}.{did_you_mean(name, known)}")
+
+
+D = TypeVar("D", bound=Declared)
+
+
+class Block:
+    """Base of every block.
+
+    A subclass declares :class:`Parameter`, :class:`Input`, :class:`Output`, :class:`State` and
+    :class:`Algebraic` as class attributes and gives `equations`. A block that switches also declares
+
+    - `modes`, the names, and `start`, the mode that a run begins in;
+    - `flags`, for each flag one number per mode; the equations read ``s.<flag>``, and ``s.clock``, the time
+      since the present mode was entered;
+    - `transitions`, a method that returns the rows.
+
+    Lines of the docstring that start with ``Differs:`` say where the block departs from the paper.
+    """
+
+    name: str = ""
+    values: dict[str, float]
+    sources: dict[str, str]
+    modes: ClassVar[tuple[str, ...]] = ()
+    start: ClassVar[str] = ""
+    flags: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    _declared: ClassVar[dict[str, Declared]] = {}
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls._declared = {
+            name: d for base in reversed(cls.__mro__) for name, d in vars(base).items() if isinstance(d, Declared)
+        }
+        problems = []
+        for name, d in cls._declared.items():
+            try:
+                dimension(d.unit)
+            except ModelError as error:
+                problems.append(f"{name}: {error}")
+            if name in ("name", "values", "sources", "modes", "start", "flags", "clock", "mode"):
+                problems.append(f"{name!r} is a name that every block has; choose another.")
+        for flag, column in cls.flags.items():
+            if flag in cls._declared:
+                problems.append(f"the flag {flag!r} has the name of a symbol of the block.")
+            if len(column) != len(cls.modes):
+                problems.append(f"the flag {flag!r} has {len(column)} values for {len(cls.modes)} modes.")
+        raise_all(problems, cls.__name__, ModelError)
+
+    def __init__(self, **values: float) -> None:
+        self.values = {name: p.value for name, p in self.declared(Parameter).items()}
+        self.sources = {name: p.source for name, p in self.declared(Parameter).items()}
+        problems = [problem for name, value in values.items() if (problem := self.problem_of(name, value))]
+        raise_all(problems, type(self).__name__, InputError)
+        self.values.update({name: float(value) for name, value in values.items()})
+        self.sources.update({name: "set by the user" for name in values})
+
+    @classmethod
+    def declared(cls, kind: type[D]) -> dict[str, D]:
+        """What the block declares of one kind, in the order of the class body."""
+        return {name: d for name, d in cls._declared.items() if isinstance(d, kind)}
+
+    def problem_of(self, parameter: str, value: float) -> str:
+        """Why `parameter` cannot be `value`, or an empty text when it can."""
+        known = self.declared(Parameter)
+        if parameter not in known:
+            return f"there is no parameter {parameter!r}.{did_you_mean(parameter, known)}"
+        low, high = known[parameter].bounds
+        if not low <= value <= high:
+            return f"{parameter} = {value:g} {known[parameter].unit} is outside [{low:g}, {high:g}]."
+        return ""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        who = f"{self.name} ({type(self).__name__})" if self.name else type(self).__name__
+        raise UnknownName(f"{who} has no {name!r}.{did_you_mean(name, self._declared)}")
+
+    # ---- what a subclass gives -------------------------------------------------------------------------
+
+    def equations(self, s: Any) -> Equations:
+        """Derivatives, outputs and residuals as pure functions of the namespace `s`."""
+        raise NotImplementedError(f"{type(self).__name__} gives no equations.")
+
+    def transitions(self, s: Any) -> tuple[Go, ...]:
+        """Rows of the table of modes, tried from top to bottom."""
+        return ()
+
+    def rest(self, s: Any) -> Mapping[str, Scalar]:
+        """Start values of states as functions of inputs and parameters, for the search of the equilibrium."""
+        return {}
+
+    # ---- use ------------------------------------------------------------------------------------------
+
+    def at(self, **values: Any) -> Namespace:
+        """Namespace with these numbers, the block's parameters and, by default, the flags of its start mode.
+
+        >>> from dcvrt.models import Pll
+        >>> pll = Pll(K_p=50.0)
+        >>> pll.equations(pll.at(v=Phasor(1.0, 0.2), xi=0.0, delta=0.0)).der["delta"]
+        10.0
+        """
+        mode = values.pop("mode", self.start)
+        known = {*self._declared, *self.flags, "clock"}
+        problems = [f"there is no {name!r}.{did_you_mean(name, known)}" for name in values if name not in known]
+        raise_all(problems, type(self).__name__, InputError)
+        given = dict(self.values)
+        if self.modes:
+            given |= {flag: column[self.modes.index(mode)] for flag, column in self.flags.items()} | {"clock": 0.0}
+        return Namespace(_owner=type(self).__name__, **(given | values))
+
+    def symbols(self, path: str) -> Namespace:
+        """One CasADi symbol for every declared name but the outputs, and for flags and clock of a block with modes."""
+
+        def symbol(name: str, kind: type) -> Any:
+            if kind is Phasor:
+                return Phasor(ca.SX.sym(f"{path}.{name}.re"), ca.SX.sym(f"{path}.{name}.im"))
+            return ca.SX.sym(f"{path}.{name}")
+
+        table = {name: symbol(name, d.kind) for name, d in self._declared.items() if not isinstance(d, Output)}
+        if self.modes:
+            table |= {name: symbol(name, float) for name in (*self.flags, "clock")}
+        return Namespace(_owner=f"{path} ({type(self).__name__})", **table)
+
+    def notes(self) -> list[str]:
+        """The deviations from the paper: the ``Differs:`` lines of the docstring, each joined to one line."""
+        notes: list[str] = []
+        inside = False
+        for line in (type(self).__doc__ or "").splitlines():
+            text = line.strip()
+            if text.startswith("Differs:"):
+                notes.append(text.removeprefix("Differs:").strip())
+                inside = True
+            elif inside and text and not text.startswith(".. "):
+                notes[-1] += " " + text
+            else:
+                inside = False
+        return notes
+
+
+def check_equations(path: str, block: Block, eq: Any) -> list[str]:
+    """Problems of what `equations` gave: missing, undeclared, of the wrong kind."""
+    who = f"{path} ({type(block).__name__})"
+    if not isinstance(eq, Equations):
+        return [f"{who}: equations() must return Equations(der=..., out=...), not {type(eq).__name__}."]
+    problems = []
+    for what, given, wanted in (
+        ("the derivative of state", eq.der, block.declared(State)),
+        ("the output", eq.out, block.declared(Output)),
+        ("the residual of algebraic variable", eq.alg, block.declared(Algebraic)),
+    ):
+        for name in wanted:
+            if name not in given:
+                problems.append(f"{who}: no equation for {what} {name!r}.")
+            elif (wanted[name].kind is Phasor) != isinstance(given[name], Phasor):
+                problems.append(f"{who}: {what} {name!r} is declared as {wanted[name].kind.__name__}, "
+                                f"but its equation gives {type(given[name]).__name__}.")
+        for name in given:
+            if name not in wanted:
+                problems.append(f"{who}: equation for {what} {name!r}, which is not declared.{did_you_mean(name, wanted)}")
+    return problems

@@ -1,0 +1,1 @@
+"""Planning: hosting capacity over all hours."""

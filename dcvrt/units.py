@@ -1,0 +1,76 @@
+"""Units of symbols, and the per-unit kinds that must never mix.
+
+Per-unit numbers look alike whatever they measure, so that a voltage can be wired to a current without anyone
+noticing. dcvrt therefore writes the kind with the unit: ``pu(V)``, ``pu(I)``, ``pu(S)``, ``pu(Z)``. Two ports may
+be wired when their units are the same product of the same bases; nothing is converted silently.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+from dcvrt.errors import ModelError, did_you_mean
+
+BASES = {
+    "1": "no unit: a ratio or a share",
+    "s": "second",
+    "h": "hour",
+    "rad": "radian",
+    "deg": "degree of angle",
+    "Hz": "hertz",
+    "pu(V)": "voltage over its base",
+    "pu(I)": "current over its base",
+    "pu(S)": "power, active, reactive or apparent, over S_B",
+    "pu(Z)": "impedance over its base",
+    "MW": "megawatt",
+    "Mvar": "megavar",
+    "MVA": "megavolt-ampere",
+}
+"""What a unit may be made of."""
+
+_FACTOR = re.compile(r"^(?P<base>pu\([A-Z]\)|[A-Za-z]+|1)(?P<power>-?\d+)?$")
+
+Dimension = tuple[tuple[str, int], ...]
+
+
+@lru_cache(maxsize=None)
+def dimension(unit: str) -> Dimension:
+    """Exponents of the bases of `unit`, sorted by base.
+
+    A unit is written as factors with a space between them, each with an optional whole exponent, and ``/``
+    before every factor that divides: ``pu(S) s``, ``rad/s2``, ``rad/s/pu(V)``.
+
+    Raises
+    ------
+    ModelError
+        a factor that is not known, and plain ``pu``, which does not say what it measures.
+
+    >>> dimension("rad/s2")
+    (('rad', 1), ('s', -2))
+    >>> dimension("pu(S)/pu(S)")
+    ()
+    """
+    powers: dict[str, int] = {}
+    for part, sign in [(piece, -1 if k else 1) for k, piece in enumerate(unit.split("/"))]:
+        # only the factor right after a slash is divided by; those after a space multiply again
+        for place, factor in enumerate(part.split()):
+            match = _FACTOR.match(factor)
+            if factor == "pu":
+                raise ModelError(f"unit {unit!r}: plain 'pu' does not say of what. Write pu(V), pu(I), pu(S) or pu(Z).")
+            if match is None or match["base"] not in BASES:
+                raise ModelError(f"unit {unit!r}: {factor!r} is not known.{did_you_mean(factor, BASES)}")
+            power = int(match["power"] or 1) * (sign if place == 0 else 1)
+            powers[match["base"]] = powers.get(match["base"], 0) + power
+    if not unit.strip():
+        raise ModelError("a unit is missing. Write '1' for a ratio.")
+    return tuple(sorted((base, power) for base, power in powers.items() if power and base != "1"))
+
+
+def same_unit(one: str, other: str) -> bool:
+    """Whether two units are the same product of the same bases.
+
+    >>> same_unit("pu(S)/s", "pu(S) s-1"), same_unit("pu(V)", "pu(I)")
+    (True, False)
+    """
+    return dimension(one) == dimension(other)
