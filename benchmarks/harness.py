@@ -65,7 +65,9 @@ def table(rows: Sequence[Result]) -> str:
     columns = ("case", "metric", "value", "unit", "baseline", "baseline_value", "ratio", "error")
     cells = [columns, *(tuple(_text(row[c]) for c in columns) for row in rows)]  # type: ignore[literal-required]
     widths = [max(len(line[k]) for line in cells) for k in range(len(columns))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+    return "\n".join(
+        "  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells
+    )
 
 
 def _text(value: Any) -> str:

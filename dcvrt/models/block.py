@@ -19,11 +19,15 @@ from dcvrt.models.phasor import Phasor, Scalar
 from dcvrt.units import dimension
 
 
+RESERVED = {"values", "sources", "clock", "mode"}
+"""Names that mean something to every block, beside those of the class."""
+
+
 class UnknownName(ModelError, AttributeError):
     """A symbol or port that the block does not declare."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Declared:
     """Something that a block declares by name."""
 
@@ -39,7 +43,7 @@ class Declared:
         return self if block is None else Port(block, self)
 
 
-@dataclass
+@dataclass(eq=False)
 class Parameter(Declared):
     """A constant of the block: value, unit, range it may be set in, meaning, and where the value comes from."""
 
@@ -62,17 +66,17 @@ class Parameter(Declared):
         return self if block is None else block.values[self.name]
 
 
-@dataclass
+@dataclass(eq=False)
 class Input(Declared):
     """A signal that another block, or the diagram, must feed."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Output(Declared):
     """A signal that the block computes."""
 
 
-@dataclass
+@dataclass(eq=False)
 class State(Declared):
     """A variable with a derivative.
 
@@ -96,7 +100,7 @@ class State(Declared):
         self.start, self.bounds, self.crossing = float(start), bounds, crossing
 
 
-@dataclass
+@dataclass(eq=False)
 class Algebraic(Declared):
     """A variable defined by an equation 0 = residual."""
 
@@ -108,14 +112,15 @@ class Algebraic(Declared):
 
 @dataclass(frozen=True)
 class Port:
-    """One named signal of one block, as `connect` takes it."""
+    """One named signal of one block, or of the diagram itself (`block` is None), as `connect` takes it."""
 
-    block: Any
+    block: Block | None
     declared: Declared
 
     def __str__(self) -> str:
-        owner = self.block.name or type(self.block).__name__
-        return f"{owner}.{self.declared.name}"
+        if self.block is None:
+            return self.declared.name
+        return f"{self.block.name or type(self.block).__name__}.{self.declared.name}"
 
 
 @dataclass(frozen=True)
@@ -171,7 +176,7 @@ class Block:
                 dimension(d.unit)
             except ModelError as error:
                 problems.append(f"{name}: {error}")
-            if name in ("name", "values", "sources", "modes", "start", "flags", "clock", "mode"):
+            if hasattr(Block, name) or name in RESERVED - ({"mode"} if isinstance(d, Output) else set()):
                 problems.append(f"{name!r} is a name that every block has; choose another.")
         for flag, column in cls.flags.items():
             if flag in cls._declared:

@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from dcvrt.errors import InputError, did_you_mean, raise_all
 
@@ -197,7 +197,7 @@ def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], list[
         try:
             sections[name] = _one_field(name, raw)
         except ValidationError as error:
-            problems += [_sentence(name, raw, item) for item in error.errors()]
+            problems += _merged([_sentence(name, raw, item) for item in error.errors()])
     return (None if problems else StudyFile(**sections)), sections, problems
 
 
@@ -220,8 +220,6 @@ def load(text: str, where: str) -> StudyFile:
 def _one_field(name: str, raw: Mapping[str, Any]) -> Any:
     """Validate one top-level table by itself, so that one bad table does not hide the others' faults."""
     field = StudyFile.model_fields[name]
-    from pydantic import TypeAdapter
-
     if name not in raw and not field.is_required():
         return field.get_default()
     kind = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
@@ -264,6 +262,16 @@ def _sentence(name: str, raw: Mapping[str, Any], item: Mapping[str, Any]) -> str
     if kind in _WANTED:
         return f"{value}: must be {_WANTED[kind]}."
     return f"{value}: {item['msg'][0].lower()}{item['msg'][1:]}."
+
+
+def _merged(sentences: list[str]) -> list[str]:
+    """One line for a field that may be of two kinds and is of neither."""
+    merged: dict[str, list[str]] = {}
+    for sentence in sentences:
+        field, _, rule = sentence.partition(": must be ")
+        merged.setdefault(field if rule else sentence, []).append(rule)
+    return [field + (": must be " + ", or ".join(rule.rstrip(".") for rule in rules) + "." if rules[0] else "")
+            for field, rules in merged.items()]
 
 
 def _known_fields(name: str) -> list[str]:

@@ -1,0 +1,156 @@
+"""Compile generated C once and keep it: compiler chain, cache of objects, interpreter when there is no compiler.
+
+Objects live in the user's cache folder under the hash of C text, compiler, flags and processor. A file appears
+there by one atomic rename, so that processes may build the same object at the same time and a killed compile
+leaves nothing that could be taken for a result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import casadi as ca
+
+from dcvrt.errors import InputError
+
+FLAGS = ("-O2", "-fno-math-errno", "-fPIC", "-shared")
+LONG_FLAGS = ("-O1", *FLAGS[1:])
+LONG_TEXT = 2_000_000
+"""Beyond this many characters of C the optimiser costs more than the runs gain."""
+
+
+class NoCompilerWarning(UserWarning):
+    """There is no C compiler: CasADi interprets the model, several times slower, with the same numbers."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """Command that compiles C, and how it identifies itself."""
+
+    command: tuple[str, ...]
+    version: str
+
+    def __str__(self) -> str:
+        return self.version
+
+
+def cache_folder() -> Path:
+    """Where compiled objects are kept: DCVRT_CACHE_DIR, or the user's cache folder."""
+    if chosen := os.environ.get("DCVRT_CACHE_DIR"):
+        return Path(chosen)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "dcvrt" / "cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "dcvrt"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dcvrt"
+
+
+def find_compiler() -> Compiler | None:
+    """First of $CC, cc, gcc, clang, ziglang that answers; None when there is none.
+
+    ``CC=none`` says that none is wanted.
+    """
+    return _find(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+
+
+@lru_cache(maxsize=8)
+def _find(wanted: str, _path: str) -> Compiler | None:
+    if wanted == "none":
+        return None
+    chain = [tuple(wanted.split())] if wanted else [("cc",), ("gcc",), ("clang",)]
+    if not wanted and importlib.util.find_spec("ziglang") is not None:
+        chain.append((sys.executable, "-m", "ziglang", "cc"))
+    for command in chain:
+        if shutil.which(command[0]) is None:
+            continue
+        answer = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+        if answer.returncode == 0 and answer.stdout.strip():
+            return Compiler(command, answer.stdout.splitlines()[0].strip())
+    if wanted:
+        raise InputError(f"CC = {wanted!r} is not a compiler that runs. Unset CC, or set CC=none to interpret.")
+    return None
+
+
+def compiled(functions: Sequence[ca.Function], derivatives: Sequence[int] = ()) -> tuple[dict[str, ca.Function], str]:
+    """Compile functions to one object and load them; without a compiler return them as they are.
+
+    Parameters
+    ----------
+    functions : what to compile; names must differ.
+    derivatives : numbers of directions of forward derivatives of `rhs` to compile too, for implicit integrators.
+
+    Returns
+    -------
+    functions by name, and a description of the backend.
+
+    Raises
+    ------
+    InputError
+        the compiler fails; its own message is kept.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        _say_interpreted()
+        return {f.name(): f for f in functions}, "CasADi interpreter (no C compiler found)"
+    names = [f.name() for f in functions]
+    generator = ca.CodeGenerator("model.c", {"with_header": False, "casadi_int": "long long int"})
+    for f in functions:
+        generator.add(f)
+        if f.name() == "rhs":
+            for n in derivatives:
+                generator.add(f.forward(n), True)
+    path = build(generator.dump(), compiler)
+    loaded = {name: ca.external(name, str(path)) for name in names}
+    return loaded, f"compiled by {compiler}"
+
+
+def build(text: str, compiler: Compiler) -> Path:
+    """Object of this C text, from the cache or compiled now."""
+    flags = FLAGS if len(text) < LONG_TEXT else LONG_FLAGS
+    key = "\n".join((text, *compiler.command, compiler.version, *flags, platform.machine(), platform.processor()))
+    folder = cache_folder()
+    path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.so"
+    if path.is_file():
+        return path
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        place = tempfile.TemporaryDirectory(dir=folder, prefix="build-")
+    except OSError as error:
+        raise InputError(
+            f"The cache folder {folder} cannot be written: {error.strerror}. Set DCVRT_CACHE_DIR to one that can."
+        ) from None
+    with place as scratch:
+        source, made = Path(scratch) / "model.c", Path(scratch) / "model.so"
+        source.write_text(text, encoding="utf-8")
+        done = subprocess.run(
+            [*compiler.command, *flags, str(source), "-o", str(made), "-lm"], capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            raise InputError(
+                f"The C compiler failed ({' '.join(compiler.command)}, exit code {done.returncode}):\n"
+                f"{done.stderr.strip()[-2000:]}\nSet CC to another compiler, or CC=none to interpret."
+            )
+        os.replace(made, path)
+    return path
+
+
+@lru_cache(maxsize=1)
+def _say_interpreted() -> None:
+    warnings.warn(
+        "No C compiler was found: CasADi interprets the model, about five times slower with the same numbers. "
+        "Install gcc or clang, or pip install 'dcvrt[compiler]'.",
+        NoCompilerWarning,
+        stacklevel=4,
+    )

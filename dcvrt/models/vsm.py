@@ -1,0 +1,101 @@
+"""Virtual synchronous machine of the grid-forming UPS."""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Any
+
+import casadi as ca
+
+from dcvrt.models import smooth
+from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
+from dcvrt.models.phasor import Phasor
+
+
+class Vsm(Block):
+    r"""Voltage source behind a virtual impedance whose angle obeys a swing equation.
+
+    .. math::
+        I^u = \frac{V - E e^{j\delta}}{Z_v}, \qquad Z_v = \frac{R_v + j X_v}{H}
+
+    .. math::
+        2 H_v \dot\omega = \frac{P^g - P^{eff}}{H} - D (\omega - 1), \qquad
+        \dot\delta = \omega_B (\omega - 1) + u, \qquad
+        u = s K_s \operatorname{Im}\{V e^{-j\delta}\}
+
+    .. math::
+        P^{eff} = P^c + s\,(P^g - P^c) - (1 - s)\, m\, [P^c - P^g]_+, \qquad
+        m = \operatorname{step}(i_p^u - I_{max})
+
+    .. math::
+        \tau_E \dot E = \operatorname{sat}_{[E_{min}, E_{max}]}\!\left(E_0 + K_Q \frac{Q^g - Q^c}{H}\right) - E, \qquad
+        T_0 \dot E_0 = h\, \frac{Q^u - Q^c}{H}
+
+    Import positive, hence the sign of the swing equation. `delta` is the angle to the network frame at
+    :math:`\omega_0`, the dq frame of the current. s is the supervisor's resync flag, m tells that more active
+    current is asked for than the limit grants, h is 1 in NORMAL; Q^u is the reactive power of I^u.
+    Paper: eqs. (gfm_internal_voltage)-(gfm_power_matching); the limiter and the current lag are blocks.
+    Equilibrium: omega = 1, P_g = P_c, Q_u = Q_c: the state in which the grid-following mode rests as well.
+    Differs: the paper's hard switch of power matching is a blend, and matches only a command that cannot be
+    met (P_c > P_g at the limit); matching the other way would hold an import that nobody wants.
+    Differs: u_sync is words in the paper; here it turns the source onto the grid voltage while uncoupled.
+    Differs: the voltage set point E_0 is trimmed slowly to the reactive command in NORMAL, as an operator
+    would set it; without it the two modes would start from different operating points.
+    """
+
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity, the base of the impedance")
+    H_v = Parameter(0.5, "s", (0.01, 10.0), "virtual inertia", "illustrative")
+    D = Parameter(60.0, "1", (0.0, 500.0), "damping", "illustrative: damping 0.7 of the swing at full load")
+    R_v = Parameter(0.02, "pu(V)/pu(I)", (0.0, 0.5), "virtual resistance on H", "illustrative")
+    X_v = Parameter(0.2, "pu(V)/pu(I)", (0.02, 1.0), "virtual reactance on H", "PSID test data; ANDES REGF1 xf")
+    f_B = Parameter(60.0, "Hz", (45.0, 65.0), "nominal frequency", "North American grid")
+    K_Q = Parameter(0.05, "pu(V)/pu(S)", (0.0, 1.0), "reactive droop over H", "ANDES REGF1: 0.045")
+    tau_E = Parameter(0.05, "s", (1e-3, 1.0), "lag of the voltage magnitude", "illustrative")
+    E_min = Parameter(0.7, "pu(V)", (0.0, 1.0), "lowest internal voltage", "illustrative")
+    E_max = Parameter(1.25, "pu(V)", (1.0, 2.0), "highest internal voltage", "illustrative")
+    T_0 = Parameter(5.0, "s", (0.1, 600.0), "trim of the set point, per pu(S)/pu(V)", "own choice: far slower than a fault")
+    K_s = Parameter(30.0, "rad/s/pu(V)", (0.0, 500.0), "gain of the resynchronisation", "illustrative")
+    eps = Parameter(1e-2, "1", (1e-6, 0.1), "width of the limit blend, over H", "own choice: numerics")
+
+    v = Input("pu(V)", "POI voltage, network frame", kind=Phasor)
+    p_c = Input("pu(S)", "active-power command")
+    q_c = Input("pu(S)", "reactive-power command")
+    p_g = Input("pu(S)", "active import achieved")
+    q_g = Input("pu(S)", "reactive import achieved")
+    shortfall = Input("pu(I)", "active current asked for beyond the limit")
+    resync = Input("1", "1: align with the grid voltage, unloaded")
+    trim = Input("1", "1: trim the voltage set point")
+    i = Output("pu(I)", "current asked for, dq frame", kind=Phasor)
+    v_dq = Output("pu(V)", "POI voltage, dq frame", kind=Phasor)
+    error = Output("pu(V)", "voltage across the frame: 0 when aligned without load")
+
+    omega = State(1.0, "1", "internal frequency over the nominal one")
+    delta = State(0.0, "rad", "angle of the internal voltage")
+    E = State(1.0, "pu(V)", "magnitude of the internal voltage")
+    E_0 = State(1.0, "pu(V)", "set point of the magnitude")
+
+    def equations(self, s: Any) -> Equations:
+        v_dq = s.v.turn(-s.delta)
+        i = (v_dq - Phasor(s.E, 0.0)) * s.H / Phasor(s.R_v, s.X_v)
+        q_u = (v_dq * i.conj()).im
+        limited = smooth.step(s.shortfall, s.eps * s.H)
+        unmet = smooth.pos(s.p_c - s.p_g, s.eps * s.H)
+        p_eff = s.p_c + s.resync * (s.p_g - s.p_c) - (1 - s.resync) * limited * unmet
+        droop = s.E_0 + s.K_Q * (s.q_g - s.q_c) / s.H
+        omega_B = 2 * pi * s.f_B
+        return Equations(
+            der=dict(
+                omega=((s.p_g - p_eff) / s.H - s.D * (s.omega - 1)) / (2 * s.H_v),
+                delta=omega_B * (s.omega - 1) + s.resync * s.K_s * v_dq.im,
+                E=(smooth.sat(droop, s.E_min, s.E_max, s.eps) - s.E) / s.tau_E,
+                E_0=s.trim * (q_u - s.q_c) / (s.H * s.T_0),
+            ),
+            out=dict(i=i, v_dq=v_dq, error=v_dq.im),
+        )
+
+    def rest(self, s: Any) -> dict[str, Any]:
+        """Internal voltage at which the unlimited current draws the commanded power."""
+        i = (Phasor(s.p_c, s.q_c) / s.v).conj()
+        internal = s.v - i * Phasor(s.R_v, s.X_v) / s.H
+        magnitude = ca.sqrt(internal.abs2())
+        return dict(omega=1.0, delta=internal.angle(), E=magnitude, E_0=magnitude)

@@ -1,0 +1,203 @@
+"""What a hosting problem is asked (`Row`) and what it answers (`Plan`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Row:
+    r"""A linear requirement on the hosted capacities: :math:`\sum_j a_j H_j \ge` `lower`.
+
+    Parameters
+    ----------
+    coefficients : mapping of bus number to float
+        a_j; sites that are not named have 0.
+    lower : float
+        Right-hand side, in the unit of the requirement.
+    label : str
+        What reports call it, for instance "voltage at 75, fault 79, GFL, beta 1.15".
+    site : int, optional
+        The site whose facility the requirement is about. It holds only while that site is open (H > 0):
+        a site without a facility has nothing that could fail. Without it the row always holds.
+    """
+
+    coefficients: Mapping[int, float]
+    lower: float
+    label: str
+    site: int | None = None
+
+    def value(self, by_site: Mapping[int, float]) -> float:
+        """Left-hand side less right-hand side at given capacities: negative when violated."""
+        return sum(a * by_site[bus] for bus, a in self.coefficients.items()) - self.lower
+
+
+@dataclass(frozen=True)
+class Binding:
+    """A limit that keeps the plan from hosting more.
+
+    Parameters
+    ----------
+    kind : str
+        `line`, `generator`, `voltage`, `row` or `bound`.
+    label : str
+        The line, the unit, the bus, the label of the row or the site.
+    price : float
+        Hosted MW gained per unit by which the limit is relaxed (0 where it binds without a price).
+    unit : str
+        Unit of the price.
+    limit : float
+        The limit itself: MVA, MW, pu, or the unit of the row.
+    hour : int, optional
+        Hour of the year.
+    bus : int, optional
+        Bus of a voltage, a unit or a site.
+    """
+
+    kind: str
+    label: str
+    price: float
+    unit: str
+    limit: float
+    hour: int | None = None
+    bus: int | None = None
+
+    def __str__(self) -> str:
+        when = "" if self.hour is None else f" in hour {self.hour}"
+        return f"{self.kind} {self.label}{when}: {self.price:.4g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How each hour was shown to have a dispatch within all limits.
+
+    Parameters
+    ----------
+    scaled : int
+        Hours served by a known dispatch, scaled towards a limit of all units until it balances.
+    programme : int
+        Hours served by the dispatch of an own linear programme.
+    combination : int
+        Hours whose load, wind and data-centre factor are a convex combination of certified hours: the same
+        combination of their dispatches serves them.
+    tolerance_mw : float
+        Largest violation of any limit that was let pass.
+    """
+
+    scaled: int
+    programme: int
+    combination: int
+    tolerance_mw: float
+
+    @property
+    def hours(self) -> int:
+        """Hours certified, by whatever method."""
+        return self.scaled + self.programme + self.combination
+
+
+@dataclass(frozen=True, eq=False)
+class VoltageInfo:
+    """How far the linear voltage screen can be trusted at the plan.
+
+    Parameters
+    ----------
+    screen : str
+        `one-shot` or `relinearised`.
+    passes : int
+        Linearisations after the first.
+    guard_pu : float
+        Hours in which the screen puts a voltage closer to a limit than this were solved by AC power flow.
+    checked : int
+        Number of these hours.
+    v_error_pu : float
+        Largest difference between AC power flow and screen in them.
+    v_min_pu, v_max_pu : float
+        Extremes of the AC voltages at `pq` buses in them; NaN when no hour was near a limit.
+    widened : int
+        Bus-hours outside the limits with nothing hosted, which must only not get worse.
+    lowest, highest : arrays (hours,)
+        Extremes of the voltages of each hour over all `pq` buses as the screen has them.
+    """
+
+    screen: str
+    passes: int
+    guard_pu: float
+    checked: int
+    v_error_pu: float
+    v_min_pu: float
+    v_max_pu: float
+    widened: int
+    lowest: npt.NDArray[np.float64] = field(repr=False)
+    highest: npt.NDArray[np.float64] = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The largest capacities that meet every limit in every hour.
+
+    Parameters
+    ----------
+    total_mw : float
+    by_site : dict of bus number to float
+        Hosted capacity H, MW.
+    binding : tuple of Binding
+        What keeps the total from growing, dearest first.
+    closed : dict of bus number to str
+        Sites without a facility, each with the reason.
+    certificate : Certificate
+    gap : float
+        Bound on what a better choice of open sites could add, over the total; 0 without such a choice.
+    voltage : VoltageInfo or None
+        None when the problem has no voltage limits.
+    """
+
+    total_mw: float
+    by_site: dict[int, float]
+    binding: tuple[Binding, ...]
+    closed: dict[int, str]
+    certificate: Certificate
+    gap: float
+    voltage: VoltageInfo | None
+
+    def table(self) -> pd.DataFrame:
+        """What binds, one row each."""
+        import pandas as pd
+
+        columns = ["kind", "label", "hour", "bus", "price", "unit", "limit"]
+        return pd.DataFrame([[getattr(b, c) for c in columns] for b in self.binding], columns=columns)
+
+
+@dataclass(frozen=True)
+class AcVerdict:
+    """AC power flow of a plan in every hour.
+
+    Parameters
+    ----------
+    passed : bool
+        Solved in every hour, with every `pq` voltage within the limits.
+    v_min_pu, v_max_pu : float
+        Extremes over `pq` buses and hours that have a solution.
+    v_error_pu : float
+        Largest difference between AC and linear screen of the extreme voltages of an hour, over hours in which
+        one of them lies within the guard band of a limit.
+    hour, bus : int or None
+        Where the voltage is nearest to a limit, or farthest beyond it.
+    status : str
+        A sentence.
+    """
+
+    passed: bool
+    v_min_pu: float
+    v_max_pu: float
+    v_error_pu: float
+    hour: int | None
+    bus: int | None
+    status: str

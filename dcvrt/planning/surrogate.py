@@ -1,0 +1,366 @@
+r"""Affine lower bounds of the ride-through margins, for the hosting programme.
+
+Two forms are fitted to the same samples:
+
+`paper`   eq. (linear_vrt_surrogate): one fit per site, fault, mode and target over all periods and ratings,
+
+    .. math:: \hat m = a + \sum_j b_j d_t H_j + c\, \beta H_i - \delta
+
+    with the loss margin in MW and the voltage margin in pu.
+    Differs: c is kept from going below 0 (`scipy.optimize.lsq_linear`). More converter rating never hurts a margin,
+    and with that the capacity never falls as beta rises.
+
+`share`   natural variables: one fit per site, fault, mode, target and beta, the loss margin as a share of the
+    import, with an intercept of its own for each period,
+
+    .. math:: \hat m_t = a_t + \sum_j b_j d_t H_j - \delta_t
+
+Both are tightened by the largest overprediction on the fitting set (eqs. (surrogate_overprediction),
+(surrogate_tightening)). A run that failed has no margin: it is left out of every fit and counted in `n_excluded`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dcvrt.errors import InputError, raise_all
+
+Floats = npt.NDArray[np.float64]
+Booleans = npt.NDArray[np.bool_]
+
+TARGETS = ("voltage", "loss")
+
+
+# -- one fit ------------------------------------------------------------------------------------------------------
+
+
+def least_squares(x: Floats, m: Floats, not_negative: Sequence[int] = ()) -> Floats:
+    """Coefficients k that minimise |x k - m|, some of them kept from going below 0.
+
+    Columns are scaled to unit length first, so that MW and pu regressors weigh alike; columns that depend on each
+    other share the effect (the solution of least norm in the scaled variables).
+
+    >>> least_squares(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]), np.array([1.0, 3.0, 5.0])).round(9).tolist()
+    [1.0, 2.0]
+    """
+    from scipy.optimize import lsq_linear
+
+    scale = np.linalg.norm(x, axis=0)
+    scale[scale == 0.0] = 1.0
+    free, *_ = np.linalg.lstsq(x / scale, m, rcond=1e-10)
+    if all(free[k] >= 0.0 for k in not_negative):
+        return np.asarray(free / scale)
+    lower = np.full(x.shape[1], -np.inf)
+    lower[list(not_negative)] = 0.0
+    bounded = lsq_linear(x / scale, m, bounds=(lower, np.inf), method="bvls", tol=1e-12)
+    return np.asarray(bounded.x / scale)
+
+
+def overprediction(predicted: Floats, m: Floats) -> float:
+    """Largest amount by which a prediction exceeds its margin; 0 where none does. Eq. (surrogate_overprediction)."""
+    return float(np.maximum(predicted - m, 0.0).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How a tightened surrogate does on points that it has not seen.
+
+    Attributes
+    ----------
+    n : number of points.
+    mae, rmse : mean absolute and root-mean-square error.
+    worst_over, worst_under : largest amount predicted above and below the true margin; 0 where there is none.
+    violation_rate : share of points predicted to pass (>= 0) that do not (< 0): false passes over all points.
+    """
+
+    n: int
+    mae: float
+    rmse: float
+    worst_over: float
+    worst_under: float
+    violation_rate: float
+
+
+def score(predicted: npt.ArrayLike, m: npt.ArrayLike) -> Scores:
+    """Compare predictions with true margins.
+
+    >>> score([0.1, -0.1], [-0.1, 0.1])
+    Scores(n=2, mae=0.2, rmse=0.2, worst_over=0.2, worst_under=0.2, violation_rate=0.5)
+    """
+    guess, true = np.asarray(predicted, dtype=float), np.asarray(m, dtype=float)
+    if not len(true):
+        return Scores(0, *[float("nan")] * 5)
+    error = guess - true
+    return Scores(
+        n=len(true), mae=float(np.abs(error).mean()), rmse=float(np.sqrt((error**2).mean())),
+        worst_over=overprediction(guess, true), worst_under=overprediction(true, guess),
+        violation_rate=float(((guess >= 0.0) & (true < 0.0)).mean()))
+
+
+# -- the data of one study ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class MarginData:
+    """Checked facility runs, one entry per (hosting vector, period, fault, site, mode, beta); arrays of one length.
+
+    Attributes
+    ----------
+    sites : candidate buses, the order of `hosting`'s columns.
+    hosting : H of every site, MW (runs, sites).
+    d : data-centre factor of the period.
+    period, fault, mode : labels.
+    site : bus number.
+    beta : rating ratio.
+    voltage : voltage margin, pu.
+    loss_share, loss_mw : loss margin as a share of the import before the fault, and in MW.
+    ok : False for a run that failed; its margins are not read.
+    sequence : modes that the supervisor passed through.
+    fit : True for a hosting vector of the fitting set.
+    name : name of the hosting vector.
+    """
+
+    sites: tuple[int, ...]
+    hosting: Floats
+    d: Floats
+    period: npt.NDArray[np.str_]
+    fault: npt.NDArray[np.str_]
+    mode: npt.NDArray[np.str_]
+    site: npt.NDArray[np.int64]
+    beta: Floats
+    voltage: Floats
+    loss_share: Floats
+    loss_mw: Floats
+    ok: Booleans
+    sequence: npt.NDArray[np.str_]
+    fit: Booleans
+    name: npt.NDArray[np.str_]
+
+    def __post_init__(self) -> None:
+        n = len(self.site)
+        problems = [f"{key} has {len(value)} entries for {n} runs." for key, value in vars(self).items()
+                    if key != "sites" and len(value) != n]
+        if not problems and self.hosting.shape[1] != len(self.sites):
+            problems.append(f"hosting has {self.hosting.shape[1]} columns for {len(self.sites)} sites.")
+        if not problems:
+            for key in ("voltage", "loss_share", "loss_mw"):
+                bad = int((self.ok & ~np.isfinite(getattr(self, key))).sum())
+                if bad:
+                    problems.append(f"{key} is not finite in {bad} run(s) that are marked ok.")
+        raise_all(problems, "margins", InputError)
+
+    def margin(self, target: str, method: str) -> Floats:
+        """The margin that `method` fits for `target`."""
+        if target == "voltage":
+            return self.voltage
+        return self.loss_mw if method == "paper" else self.loss_share
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """One tightened affine margin of one site, fault, mode and target.
+
+    Attributes
+    ----------
+    method, site, fault, mode, target : what it stands for.
+    period, beta : '' and 0.0 where it is pooled over them.
+    intercept : tightened intercept.
+    slopes : per MW of data-centre load P_j = d_t H_j, in the order of the sites.
+    rating_slope : per MVA of the site's own rating, 0 in method 'share'.
+    tightening : how much the intercept was lowered.
+    n_fit, n_excluded : points fitted; points of the fitting set left out because their run failed.
+    n_mixed, n_sequences : fitting points whose event sequence is not the most common one; how many sequences.
+    scores : on the validation set.
+    validation : (names, margins, predictions) of the validation points.
+    """
+
+    method: str
+    site: int
+    fault: str
+    mode: str
+    target: str
+    period: str
+    beta: float
+    intercept: float
+    slopes: Floats
+    rating_slope: float
+    tightening: float
+    n_fit: int
+    n_excluded: int
+    n_mixed: int
+    n_sequences: int
+    scores: Scores
+    validation: tuple[npt.NDArray[np.str_], Floats, Floats]
+
+    def at(self, beta: float, d: float, own: int) -> tuple[Floats, float]:
+        """Coefficients over H and bound of the row `coefficients @ H >= bound` at a rating and a period.
+
+        Parameters
+        ----------
+        beta : rating ratio.
+        d : data-centre factor of the period.
+        own : position of the surrogate's site.
+        """
+        coefficients = d * self.slopes
+        coefficients[own] += self.rating_slope * beta
+        return coefficients, -self.intercept
+
+    def predict(self, hosting: Floats, d: Floats | float, beta: Floats | float, own: int) -> Floats:
+        """Predicted margin for hosting vectors (points, sites)."""
+        load = hosting * np.reshape(d, (-1, 1))
+        return np.asarray(self.intercept + load @ self.slopes + self.rating_slope * np.asarray(beta) * hosting[:, own])
+
+
+def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
+    """Fit and tighten every margin of a study.
+
+    Parameters
+    ----------
+    data : the checked runs.
+    method : 'paper' or 'share'.
+
+    Returns
+    -------
+    list of Surrogate
+        One for each site, fault, mode and target ('paper'); for each of these at every beta and period ('share').
+
+    Raises
+    ------
+    InputError
+        For an unknown method, and where so many runs failed that a fit has fewer points than coefficients.
+    """
+    if method not in ("paper", "share"):
+        raise InputError(f"surrogate method {method!r}: must be 'paper' or 'share'.")
+    fits: list[Surrogate] = []
+    problems: list[str] = []
+    for chosen in _groups(data, by_beta=method == "share"):
+        for target in TARGETS:
+            found = (_fit_paper if method == "paper" else _fit_share)(data, chosen, target)
+            if isinstance(found, str):
+                problems.append(found)
+            else:
+                fits += found
+    raise_all(problems, f"surrogate '{method}'", InputError)
+    return fits
+
+
+def _groups(data: MarginData, by_beta: bool) -> Iterator[npt.NDArray[np.int64]]:
+    """Positions of the runs that one fit is made from, in a fixed order."""
+    keys = np.rec.fromarrays([data.mode, data.site, data.fault, data.beta if by_beta else np.zeros(len(data.site))])
+    _, group = np.unique(keys, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
+
+
+def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate] | str:
+    own = data.sites.index(int(data.site[chosen[0]]))
+    load = data.hosting[chosen] * data.d[chosen, None]
+    rating = data.beta[chosen] * data.hosting[chosen, own]
+    x = np.column_stack([np.ones(len(chosen)), load, rating])
+    m = data.margin(target, "paper")[chosen]
+    fitted = data.fit[chosen] & data.ok[chosen]
+    if fitted.sum() < x.shape[1]:
+        return _too_few(data, chosen, target, int(fitted.sum()), x.shape[1])
+    k = least_squares(x[fitted], m[fitted], not_negative=[x.shape[1] - 1])
+    tightening = overprediction(x[fitted] @ k, m[fitted])
+    return [_surrogate("paper", data, chosen, target, m, x @ k - tightening, intercept=k[0] - tightening, slopes=k[1:-1],
+                       rating_slope=k[-1], tightening=tightening, period="", beta=0.0)]
+
+
+def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate] | str:
+    load = data.hosting[chosen] * data.d[chosen, None]
+    periods = sorted(set(data.period[chosen].tolist()))
+    in_period = np.stack([data.period[chosen] == period for period in periods], axis=1)
+    x = np.column_stack([in_period.astype(float), load])
+    m = data.margin(target, "share")[chosen]
+    fitted = data.fit[chosen] & data.ok[chosen]
+    if fitted.sum() < x.shape[1] or not in_period[fitted].any(axis=0).all():
+        return _too_few(data, chosen, target, int(fitted.sum()), x.shape[1])
+    k = least_squares(x[fitted], m[fitted])
+    fits = []
+    for t, period in enumerate(periods):
+        here = in_period[:, t]
+        tightening = overprediction(x[fitted & here] @ k, m[fitted & here])
+        fits.append(_surrogate(
+            "share", data, chosen[here], target, m[here], x[here] @ k - tightening, intercept=k[t] - tightening,
+            slopes=k[len(periods):], rating_slope=0.0, tightening=tightening, period=period,
+            beta=float(data.beta[chosen[0]])))
+    return fits
+
+
+def _surrogate(method: str, data: MarginData, chosen: npt.NDArray[np.int64], target: str, m: Floats, predicted: Floats,
+               **fitted: object) -> Surrogate:
+    """Put a fit together with the counts and scores of its points."""
+    ok, fit = data.ok[chosen], data.fit[chosen]
+    sequences = Counter(data.sequence[chosen[fit & ok]].tolist())
+    unseen = ~fit & ok
+    first = chosen[0]
+    return Surrogate(
+        method=method, site=int(data.site[first]), fault=str(data.fault[first]), mode=str(data.mode[first]),
+        target=target, n_fit=int((fit & ok).sum()), n_excluded=int((fit & ~ok).sum()),
+        n_mixed=sum(sequences.values()) - max(sequences.values()), n_sequences=len(sequences),
+        scores=score(predicted[unseen], m[unseen]),
+        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen]),
+        **fitted)  # type: ignore[arg-type]
+
+
+def _too_few(data: MarginData, chosen: npt.NDArray[np.int64], target: str, have: int, need: int) -> str:
+    k = chosen[0]
+    failed = int((data.fit[chosen] & ~data.ok[chosen]).sum())
+    return (f"{target} margin at bus {data.site[k]}, fault {data.fault[k]}, {data.mode[k]}: {have} good run(s) to fit "
+            f"{need} coefficients ({failed} run(s) failed). Way out: raise sampling.n, or see why runs fail in the store.")
+
+
+# -- summary ------------------------------------------------------------------------------------------------------
+
+
+def pooled_scores(fits: Sequence[Surrogate]) -> list[dict[str, float | int | str]]:
+    """Validation figures over all sites and faults, one row per method, mode and target.
+
+    The loss target is in MW for method 'paper' and a share for 'share': errors of the two are not comparable,
+    violation rates are.
+    """
+    rows: list[dict[str, float | int | str]] = []
+    keys = sorted({(f.method, f.mode, f.target) for f in fits})
+    for method, mode, target in keys:
+        members = [f for f in fits if (f.method, f.mode, f.target) == (method, mode, target)]
+        true = np.concatenate([f.validation[1] for f in members])
+        guess = np.concatenate([f.validation[2] for f in members])
+        s = score(guess, true)
+        rows.append({
+            "method": method, "mode": mode, "target": target, "mae": s.mae, "rmse": s.rmse, "worst_over": s.worst_over,
+            "worst_under": s.worst_under, "violation_rate": s.violation_rate,
+            "n_fit": sum(f.n_fit for f in members), "n_validation": s.n})
+    return rows
+
+
+def false_passes(fits: Sequence[Surrogate]) -> int:
+    """Validation points that a tightened surrogate passes and the simulation does not."""
+    return sum(int(((f.validation[2] >= 0) & (f.validation[1] < 0)).sum()) for f in fits)
+
+
+def closed_sites(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d: Mapping[str, float],
+                 upper: npt.ArrayLike) -> dict[int, Surrogate]:
+    """Sites at which a margin is negative wherever one looks in the box: closed whatever the programme does.
+
+    Returns
+    -------
+    dict of site to Surrogate
+        The first margin that no hosting vector in [0, upper] makes non-negative.
+    """
+    closed: dict[int, Surrogate] = {}
+    box = np.asarray(upper, dtype=float)
+    for f in fits:
+        if f.site in closed:
+            continue
+        for period in (f.period,) if f.period else d:
+            coefficients, bound = f.at(beta, d[period], sites.index(f.site))
+            if float(np.maximum(coefficients, 0.0) @ box) < bound:
+                closed[f.site] = f
+                break
+    return closed

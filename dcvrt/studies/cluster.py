@@ -1,0 +1,160 @@
+"""Workers through dask.distributed: on this machine, or wherever a scheduler's address leads.
+
+As many tasks are handed out as there are workers, no more: so the time of a task counts from when it is handed out,
+and a dying worker takes one task with it. A task whose worker died is done again alone, with nothing else running
+beside it, so that no task is blamed for another's death.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from dcvrt.errors import InputError
+from dcvrt.studies.campaign import Outcome, Task, TaskFunction, attempt
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class Cluster:
+    """Workers of a dask scheduler.
+
+    Parameters
+    ----------
+    workers : how many to start on this machine; not used with `scheduler`.
+    scheduler : address of a running scheduler, e.g. "tcp://host:8786". Its workers need dcvrt installed.
+
+    Raises
+    ------
+    InputError
+        On entering, when no scheduler answers at the address or it has no workers.
+    """
+
+    def __init__(self, workers: int, scheduler: str | None = None) -> None:
+        self.workers, self.scheduler = workers, scheduler
+        self._client: Any = None
+        self._cluster: Any = None
+
+    def __enter__(self) -> Cluster:
+        import dask
+        from distributed import Client, LocalCluster
+
+        for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        self._settings = dask.config.set({
+            "distributed.scheduler.allowed-failures": 0,
+            "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+            "distributed.worker.memory.terminate": False,
+        })
+        self._main = _without_main_file()
+        self._main.__enter__()
+        if self.scheduler is None:
+            self._cluster = LocalCluster(n_workers=self.workers, threads_per_worker=1, processes=True,
+                                         dashboard_address=None, silence_logs=logging.CRITICAL)
+            self._client = Client(self._cluster)
+            return self
+        try:
+            self._client = Client(self.scheduler, timeout=5)
+        except (OSError, ValueError, TimeoutError) as error:
+            self.__exit__()
+            raise InputError(f"no dask scheduler answers at {self.scheduler!r} ({type(error).__name__}). "
+                             "Way out: start one with 'dask scheduler' and give the address that it prints.") from None
+        if not self._client.nthreads():
+            self.__exit__()
+            raise InputError(f"the scheduler at {self.scheduler!r} has no workers. "
+                             f"Way out: start some with 'dask worker {self.scheduler}'.")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._client is not None:
+            self._client.close()
+        if self._cluster is not None:
+            self._cluster.close(timeout=10)
+        self._main.__exit__(None, None, None)
+        self._settings.__exit__(None, None, None)
+
+    def run(self, tasks: Sequence[Task], function: TaskFunction, timeout_s: float, tries: int,
+            started: Callable[[Task], int]) -> Iterator[tuple[Task, Outcome]]:
+        """See `dcvrt.studies.campaign.Crew`."""
+        waiting, suspects = deque(tasks), deque[Task]()
+        running: dict[Any, tuple[Task, float, int]] = {}
+        alone = False
+        while waiting or suspects or running:
+            if not running:
+                alone = not waiting
+            source = suspects if alone else waiting
+            while source and len(running) < (1 if alone else self._places()):
+                task = source.popleft()
+                future = self._client.submit(attempt, function, dict(task.payload), key=f"{task.key}-{time.time_ns()}",
+                                             pure=False)
+                running[future] = (task, time.monotonic(), started(task))
+            for future in self._ended(running, timeout_s):
+                task, begin, starts = running.pop(future)
+                outcome = self._outcome(future, timeout_s, time.monotonic() - begin, starts)
+                if outcome.state == "died" and starts < tries:
+                    suspects.append(task)
+                else:
+                    yield task, outcome
+
+    def _places(self) -> int:
+        """Tasks that can run at once. A worker that is being replaced keeps its place."""
+        if self._cluster is not None:
+            return self.workers
+        return max(1, sum(self._client.nthreads().values()))
+
+    def _ended(self, running: dict[Any, tuple[Task, float, int]], timeout_s: float) -> list[Any]:
+        """Wait until something has ended or run out of time."""
+        from distributed import wait
+
+        while True:
+            try:
+                done = list(wait(list(running), timeout=0.5, return_when="FIRST_COMPLETED").done)
+            except TimeoutError:
+                done = []
+            now = time.monotonic()
+            late = [f for f, (_, begin, _) in running.items() if now - begin > timeout_s and f not in done]
+            if done or late:
+                order = list(running)
+                return sorted(done + late, key=order.index)
+
+    def _outcome(self, future: Any, timeout_s: float, seconds: float, starts: int) -> Outcome:
+        from distributed import KilledWorker
+
+        if future.status == "finished":
+            result = future.result()
+            assert isinstance(result, Outcome)
+            return result
+        if future.status == "pending":
+            where = [address for address, keys in self._client.processing().items() if future.key in map(str, keys)]
+            future.cancel(force=True)
+            if where:
+                self._client.restart_workers(where, timeout=60, raise_for_error=False)
+            return Outcome("timeout", message=f"took longer than {timeout_s:g} s", seconds=seconds)
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            times = "once" if starts == 1 else f"{starts} times"
+            return Outcome("died", message=f"its worker died {times} while doing it", seconds=seconds)
+        return Outcome("failed", message=f"{type(error).__name__}: {error}"[:500], seconds=seconds)
+
+
+@contextmanager
+def _without_main_file() -> Iterator[None]:
+    """Keep spawned workers from running the user's script again.
+
+    A spawned process imports the file of `__main__`, which is the script that called `Study.run`; without a guard
+    in the script that would start the study once more in every worker. Tasks are functions of importable modules,
+    so the workers do not need it.
+    """
+    main = sys.modules["__main__"]
+    hidden = {name: vars(main)[name] for name in ("__file__", "__spec__") if name in vars(main)}
+    vars(main).pop("__file__", None)
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        vars(main).update(hidden)

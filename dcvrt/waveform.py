@@ -1,0 +1,517 @@
+r"""Voltage at the point of interconnection (POI) over time: what a facility has to ride through.
+
+A :class:`Waveform` is the positive-sequence phasor V(t) in per unit on given times. **A time that stands
+twice is a jump**: the first value holds up to it, the second from it on. Between jumps V is a C1 cubic
+
+.. math::
+    V(t_k + s T_k) = c_0 + c_1 s + c_2 s^2 + c_3 s^3, \qquad 0 \le s \le 1,
+
+through the samples, with the slope of the parabola through three neighbours at inner samples and the one-sided
+parabola at jumps and ends. The slopes are linear in the samples, so a tangent dV/dtheta that is given on the
+same times is interpolated to the exact derivative of V(t). Two points alone are joined by a straight line, which
+is why the stepped waveforms below mark their corners as (empty) jumps: constants and ramps are met exactly.
+"""
+
+from __future__ import annotations
+
+import cmath
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dcvrt.errors import InputError, did_you_mean, raise_all
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Segment = tuple[float, complex] | tuple[float, complex, complex]
+
+TIME_NAMES = ("t", "time", "t_s", "time_s", "seconds")
+MAGNITUDE_NAMES = ("v", "vm", "v_mag", "v_pu", "v_poi", "v_poi_pu", "magnitude", "voltage")
+ANGLE_NAMES = ("angle", "angle_deg", "v_angle", "v_angle_deg", "v_deg")
+PHASE_NAMES = (("v_a", "v_b", "v_c"), ("va", "vb", "vc"), ("v_l1", "v_l2", "v_l3"), ("l1", "l2", "l3"))
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Piecewise cubic: value = sum_j coefficients[k, j] * s**j with s = (t - start[k]) / length[k] in [0, 1].
+
+    `after_jump[k]` marks pieces that do not continue the one before them.
+    """
+
+    start: Array
+    length: Array
+    coefficients: NDArray[Any]
+    after_jump: NDArray[np.bool_]
+
+    def at(self, t: ArrayLike) -> NDArray[Any]:
+        """Value at times `t`; at a jump the value after it. Outside the range the end values hold."""
+        t = np.asarray(t, dtype=float)
+        k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
+        s = np.clip((t - self.start[k]) / self.length[k], 0.0, 1.0)
+        c = self.coefficients[k]
+        return c[..., 0] + s * (c[..., 1] + s * (c[..., 2] + s * c[..., 3]))
+
+    def split(self, times: Array) -> Pieces:
+        """Express the same function with further breakpoints at `times`; ends are not extended."""
+        end = self.start[-1] + self.length[-1]
+        inside = times[(times > self.start[0]) & (times < end)]
+        start = np.unique(np.concatenate([self.start, inside]))
+        stop = np.append(start[1:], end)
+        k = np.searchsorted(self.start, start, side="right") - 1
+        a = (start - self.start[k]) / self.length[k]
+        h = (stop - start) / self.length[k]
+        c0, c1, c2, c3 = self.coefficients[k].T
+        moved = (
+            c0 + a * (c1 + a * (c2 + a * c3)),
+            h * (c1 + a * (2 * c2 + 3 * a * c3)),
+            h**2 * (c2 + 3 * a * c3),
+            h**3 * c3,
+        )
+        return Pieces(
+            start, stop - start, np.stack(moved, axis=1), self.after_jump[k] & (start == self.start[k])
+        )
+
+
+def cubic_pieces(t: Array, v: NDArray[Any]) -> Pieces:
+    """Pieces of the C1 cubic through `v` at `t`; a time that stands twice is a jump."""
+    slope_left, slope_right = _slopes(t, v)
+    real = np.flatnonzero(np.diff(t) > 0)
+    length = t[real + 1] - t[real]
+    m0, m1, rise = slope_right[real] * length, slope_left[real + 1] * length, v[real + 1] - v[real]
+    coefficients = np.stack((v[real], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise), axis=1)
+    after_jump = np.zeros(len(real), dtype=bool)
+    after_jump[1:] = np.diff(real) > 1
+    return Pieces(t[real], length, coefficients, after_jump)
+
+
+def _slopes(t: Array, v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Slopes towards the left and the right of every sample: parabola through three neighbours between jumps."""
+    slope = np.zeros_like(v)
+    edges = np.concatenate(([0], np.flatnonzero(np.diff(t) == 0) + 1, [len(t)]))
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        if b - a < 2:
+            continue
+        h = np.diff(t[a:b])
+        secant = np.diff(v[a:b]) / h
+        if b - a == 2:
+            slope[a:b] = secant[0]
+            continue
+        slope[a + 1 : b - 1] = (h[1:] * secant[:-1] + h[:-1] * secant[1:]) / (h[:-1] + h[1:])
+        slope[a] = secant[0] + h[0] * (secant[0] - secant[1]) / (h[0] + h[1])
+        slope[b - 1] = secant[-1] + h[-1] * (secant[-1] - secant[-2]) / (h[-1] + h[-2])
+    return slope, slope
+
+
+def check_samples(t: ArrayLike, v: ArrayLike, what: str) -> list[str]:
+    """Say what is wrong with samples `v` on times `t`: one line a fault, none when they can be used."""
+    t, v = np.asarray(t), np.asarray(v)
+    if t.ndim != 1 or v.shape != t.shape:
+        return [f"t has shape {t.shape} and {what} {v.shape}; both must be one column of the same length."]
+    if len(t) < 2:
+        return [f"{len(t)} sample(s); at least two times are needed."]
+    problems = []
+    for label, values in (("t", t), (what, v)):
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+            problems.append(f"{label}[{bad[0]}] is {values[bad[0]]}{more}.")
+    step = np.diff(t)
+    back = np.flatnonzero(step < 0)
+    if len(back):
+        k = back[0] + 1
+        problems.append(
+            f"times do not increase: t[{k}] = {t[k]:g} s comes after t[{k - 1}] = {t[k - 1]:g} s."
+        )
+    triple = np.flatnonzero((step[:-1] == 0) & (step[1:] == 0))
+    if len(triple):
+        k = triple[0]
+        problems.append(
+            f"t[{k}] = t[{k + 1}] = t[{k + 2}] = {t[k]:g} s: a time may stand twice (a jump), not three times."
+        )
+    if not problems and t[-1] <= t[0]:
+        problems.append(f"it lasts no time: first and last time are {t[0]:g} s.")
+    return problems
+
+
+@dataclass(frozen=True, eq=False)
+class Waveform:
+    """Positive-sequence POI voltage phasor over time, with its jumps marked.
+
+    Parameters
+    ----------
+    t : times in s, increasing; a time that stands twice is a jump.
+    v : complex voltage in pu on these times (network frame); real values are magnitudes at angle 0.
+    tangents : dV/dtheta per named quantity, complex, on the same times (pu per unit of theta).
+    name : shown in reports.
+
+    Raises
+    ------
+    InputError
+        NaN, times that do not increase, a time that stands three times, fewer than two samples, shapes that differ.
+
+    Examples
+    --------
+    >>> w = Waveform.sag(retained=0.5, start=0.1, length=0.15, until=1.0)
+    >>> complex(w.at(0.2)), w.jumps
+    ((0.5+0j), (0.1, 0.25))
+    """
+
+    t: Array
+    v: ComplexArray
+    tangents: Mapping[str, ComplexArray] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        problems = check_samples(self.t, self.v, "v")
+        for tangent, values in self.tangents.items():
+            problems += [
+                p for p in check_samples(self.t, values, f"tangents[{tangent!r}]") if "tangents" in p
+            ]
+        raise_all(problems, f"waveform {self.name!r}" if self.name else "waveform")
+        set_ = object.__setattr__
+        set_(self, "t", _frozen(np.asarray(self.t, dtype=float)))
+        set_(self, "v", _frozen(np.asarray(self.v, dtype=complex)))
+        tangents = {k: _frozen(np.asarray(x, dtype=complex)) for k, x in self.tangents.items()}
+        set_(self, "tangents", MappingProxyType(tangents))
+        set_(self, "_pieces", {})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Waveform, (np.array(self.t), np.array(self.v), dict(self.tangents), self.name)
+
+    # -- constructors -------------------------------------------------------------------------------------
+
+    @classmethod
+    def segments(
+        cls, steps: Sequence[Segment], until: float | None = None, name: str = "segments"
+    ) -> Waveform:
+        """Build from steps and ramps.
+
+        Parameters
+        ----------
+        steps : entries ``(t, v)`` - from `t` on the voltage is `v` - or ``(t, v_from, v_to)`` - at `t` it steps to
+            `v_from` and goes straight to `v_to`, which it reaches when the next entry begins. Values are
+            magnitudes or complex, pu.
+        until : end of the waveform, s; 1 s after the last entry unless given.
+
+        Examples
+        --------
+        >>> w = Waveform.segments([(0.0, 1.0), (0.1, 0.5), (0.2, 0.7, 1.0), (0.6, 1.0)], until=1.0)
+        >>> w.magnitude.tolist()
+        [1.0, 1.0, 0.5, 0.5, 0.7, 1.0, 1.0, 1.0]
+        """
+        if not steps:
+            raise InputError(
+                "waveform: no segments given; write for example [(0.0, 1.0), (0.1, 0.5), (0.2, 1.0)]."
+            )
+        wrong = [k for k, s in enumerate(steps) if len(s) not in (2, 3)]
+        if wrong:
+            raise InputError(
+                f"waveform: segment {wrong[0]} is {steps[wrong[0]]!r}; write (t, v) or (t, v_from, v_to)."
+            )
+        begins = [float(s[0]) for s in steps]
+        last = begins[-1] + 1.0 if until is None else float(until)
+        ends = [*begins[1:], last]
+        late = [
+            f"segment {k} begins at {a:g} s and ends at {b:g} s; times must increase."
+            for k, (a, b) in enumerate(zip(begins, ends, strict=True))
+            if not b > a
+        ]
+        raise_all(late, "waveform")
+        t = [x for pair in zip(begins, ends, strict=True) for x in pair]
+        v = [x for s in steps for x in (complex(s[1]), complex(s[-1]))]
+        return cls(np.array(t), np.array(v), name=name)
+
+    @classmethod
+    def sag(
+        cls, retained: float, start: float, length: float, until: float, phase_jump: float = 0.0
+    ) -> Waveform:
+        """Rectangular sag from 1 pu to `retained` pu (a swell when above 1).
+
+        Parameters
+        ----------
+        retained : voltage magnitude in the sag, pu.
+        start, length, until : begin and duration of the sag and end of the waveform, s.
+        phase_jump : angle of the phasor during the sag, rad.
+        """
+        if retained < 0.0 or length <= 0.0:
+            raise InputError(
+                f"sag: retained = {retained:g} pu must not be negative, length = {length:g} s not zero."
+            )
+        during = retained * cmath.exp(1j * phase_jump)
+        steps: list[Segment] = [(0.0, 1.0), (start, during), (start + length, 1.0)]
+        return cls.segments(steps, until, name=f"sag to {retained:g} pu for {length * 1e3:g} ms")
+
+    @classmethod
+    def from_samples(
+        cls,
+        t: ArrayLike,
+        v: ArrayLike,
+        tangents: Mapping[str, ArrayLike] | None = None,
+        jumps: Iterable[float] | None = None,
+        name: str = "samples",
+    ) -> Waveform:
+        """Wrap sampled values.
+
+        Parameters
+        ----------
+        t, v : times in s and complex or magnitude values in pu; a time that stands twice is a jump.
+        tangents : dV/dtheta on the same times.
+        jumps : times at which `v` jumps although no time stands twice there: the sample before holds up to
+            the jump, the sample after from it on.
+        """
+        t, v = np.asarray(t, dtype=float), np.asarray(v, dtype=complex)
+        columns = {k: np.asarray(x, dtype=complex) for k, x in (tangents or {}).items()}
+        raise_all(check_samples(t, v, "v"), f"waveform {name!r}")
+        for jump in sorted(jumps or ()):
+            if not t[0] < jump < t[-1]:
+                raise InputError(f"waveform: jump at {jump:g} s is outside ({t[0]:g}, {t[-1]:g}) s.")
+            k = int(np.searchsorted(t, jump, side="left"))
+            before, after = np.flatnonzero(t == jump), np.array([jump, jump])
+            if len(before) == 2:
+                continue
+            missing = after[len(before) :]
+            t = np.insert(t, k, missing)
+            take = np.insert(np.arange(len(v)), k, [k - 1, k][: len(missing)])
+            v, columns = v[take], {name_: x[take] for name_, x in columns.items()}
+        return cls(t, v, columns, name)
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | Path,
+        phases: Literal["minimum", "mean"] | None = None,
+        jumps: Iterable[float] | None = None,
+    ) -> Waveform:
+        """Read a table with a header: a time column in s and the voltage in pu.
+
+        The voltage is `v_re` and `v_im`, or a magnitude with or without `angle` in degrees, or three RMS
+        phase voltages `v_a`, `v_b`, `v_c` that `phases` reduces to their minimum or mean (a facility model here
+        is positive-sequence: the minimum is the careful choice). Separators ``,`` ``;`` or tab, a byte-order
+        mark, a decimal comma, a leading count line and lines that begin with ``#`` are understood.
+
+        Raises
+        ------
+        InputError
+            a missing column (with the columns found), a cell that is not a number, unusable samples.
+        """
+        table = read_table(Path(path))
+        where = f"{path}: waveform table"
+        t = _column(table, TIME_NAMES, where)
+        v = _voltage(table, phases, where)
+        try:
+            return cls.from_samples(t, v, jumps=jumps, name=Path(path).stem)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def from_comtrade(
+        cls,
+        path: str | Path,
+        magnitude: str,
+        angle: str | None = None,
+        base: float = 1.0,
+        jumps: Iterable[float] | None = None,
+    ) -> Waveform:
+        """Read RMS or phasor channels of a COMTRADE record (.cfg with .dat beside it, or .cff).
+
+        Parameters
+        ----------
+        magnitude, angle : names of the analogue channels with the magnitude and the angle in degrees. Channels with
+            the instantaneous wave are not phasors: take their phasor first.
+        base : value of `magnitude` that is 1 pu.
+        """
+        try:
+            import comtrade  # type: ignore[import-not-found, unused-ignore]
+        except ModuleNotFoundError:
+            raise InputError(
+                "Reading COMTRADE needs the package 'comtrade': pip install 'dcvrt[comtrade]'. "
+                "Or export the record to CSV and use Waveform.from_csv."
+            ) from None
+        record = comtrade.load(str(path))
+        found = {
+            str(n).strip(): np.asarray(x, dtype=float)
+            for n, x in zip(record.analog_channel_ids, record.analog, strict=True)
+        }
+        for channel in filter(None, (magnitude, angle)):
+            if channel not in found:
+                raise InputError(f"{path}: no analogue channel {channel!r}.{did_you_mean(channel, found)}")
+        turn = np.deg2rad(found[angle]) if angle else 0.0
+        v = found[magnitude] / base * np.exp(1j * turn)
+        return cls.from_samples(np.asarray(record.time, dtype=float), v, jumps=jumps, name=Path(path).stem)
+
+    @classmethod
+    def ercot_style(cls) -> Waveform:
+        """Test waveform with ramp, shallow fault, deep fault and high voltage, 10 s.
+
+        Our own composition on the voltage and time boundaries of ERCOT NOGRR282 (0.90, 0.80, 0.50, 0.20 and
+        1.20 pu; 2.0, 0.5 and 0.25 s). It is **not** ERCOT's test waveform, which was not available.
+        """
+        steps: list[Segment] = [
+            (0.0, 1.0),
+            (0.5, 1.0, 0.91), (1.0, 0.91), (1.5, 0.91, 1.0), (2.0, 1.0),  # ramp inside the continuous range
+            (2.5, 0.80), (3.0, 1.0),  # shallow fault
+            (4.0, 0.20), (4.25, 0.50), (4.5, 0.80), (6.0, 1.0),  # deep fault, back along the envelope
+            (7.0, 1.20), (9.0, 1.0),  # high voltage
+        ]  # fmt: skip
+        return cls.segments(steps, until=10.0, name="ERCOT-style (not the official waveform)")
+
+    # -- what it holds ------------------------------------------------------------------------------------
+
+    @property
+    def magnitude(self) -> Array:
+        """|V| on `t`, pu."""
+        return np.abs(self.v)
+
+    @property
+    def jumps(self) -> tuple[float, ...]:
+        """Times that stand twice, s."""
+        return tuple(self.t[1:][np.diff(self.t) == 0].tolist())
+
+    @property
+    def start(self) -> float:
+        """First time, s."""
+        return float(self.t[0])
+
+    @property
+    def until(self) -> float:
+        """Last time, s."""
+        return float(self.t[-1])
+
+    def pieces(self, tangent: str | None = None) -> Pieces:
+        """Times and cubic coefficients of V, or of one of its tangents."""
+        cache: dict[str | None, Pieces] = self.__dict__["_pieces"]
+        if tangent not in cache:
+            if tangent is not None and tangent not in self.tangents:
+                raise InputError(
+                    f"waveform {self.name!r} has no tangent {tangent!r}.{did_you_mean(tangent, self.tangents)}"
+                )
+            cache[tangent] = cubic_pieces(self.t, self.v if tangent is None else self.tangents[tangent])
+        return cache[tangent]
+
+    def at(self, t: ArrayLike) -> Any:
+        """Phasor at times `t`, pu; at a jump the value after it, outside the range the end values."""
+        value = self.pieces().at(t)
+        return complex(value) if np.ndim(value) == 0 else value
+
+    def same_layout(self, other: Waveform) -> bool:
+        """Whether both stand on the same times with jumps at the same places."""
+        return np.array_equal(self.t, other.t)
+
+    def shifted(self, by: float) -> Waveform:
+        """Shift in time by `by` s."""
+        return replace(self, t=self.t + by)
+
+    def resampled(self, dt: float) -> Waveform:
+        """Sample anew so that no step is longer than `dt` s; jumps stay where they are."""
+        if not dt > 0:
+            raise InputError(f"waveform: dt = {dt:g} s must be positive.")
+        edges = np.concatenate(([0], np.flatnonzero(np.diff(self.t) == 0) + 1, [len(self.t)]))
+        runs = [(self.t[a], self.t[b - 1]) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 1]
+        grids = [np.linspace(a, b, max(2, math.ceil((b - a) / dt - 1e-9) + 1)) for a, b in runs]
+        t = np.concatenate(grids)
+
+        def on_grids(tangent: str | None) -> ComplexArray:
+            pieces = self.pieces(tangent)
+            parts = [pieces.at(grid) for grid in grids]
+            for part, grid in zip(
+                parts, grids, strict=True
+            ):  # the end of a run lies before the jump, not after it
+                part[-1] = pieces.coefficients[np.searchsorted(pieces.start, grid[-1], side="left") - 1].sum()
+            return np.concatenate(parts)
+
+        return Waveform(t, on_grids(None), {k: on_grids(k) for k in self.tangents}, self.name)
+
+
+def _frozen(values: NDArray[Any]) -> NDArray[Any]:
+    values = values.copy()
+    values.setflags(write=False)
+    return values
+
+
+# -- tables -----------------------------------------------------------------------------------------------
+
+
+def read_table(path: Path) -> dict[str, Array]:
+    """Read a delimited table with a header into columns; names are lower case without units in brackets."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
+    lines = [
+        (k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")
+    ]
+    if lines and lines[0][1].strip().isdigit():
+        lines = lines[1:]
+    if len(lines) < 2:
+        raise InputError(f"{path}: {len(lines)} line(s); a header and at least two rows are needed.")
+    header = lines[0][1]
+    separator = next((s for s in (";", "\t", ",") if s in header), ",")
+    names = [n.split("[")[0].split("(")[0].strip().strip('"').lower() for n in header.split(separator)]
+    if all(_number(n, separator) is not None for n in names):
+        raise InputError(
+            f"{path}: the first line {header!r} is numbers; name the columns there, for example t,v_re,v_im."
+        )
+    problems, rows = [], []
+    for (line_number, _), cells in zip(
+        lines[1:],
+        csv.reader(io.StringIO("\n".join(x for _, x in lines[1:])), delimiter=separator),
+        strict=True,
+    ):
+        numbers = [_number(cell, separator) for cell in cells]
+        if len(cells) != len(names):
+            problems.append(f"line {line_number} has {len(cells)} cells, the header {len(names)}.")
+        elif None in numbers:
+            k = numbers.index(None)
+            problems.append(f"line {line_number}, column {names[k]!r}: {cells[k]!r} is not a number.")
+        rows.append(numbers)
+    raise_all(problems[:20], str(path))
+    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+
+
+def _number(cell: str, separator: str) -> float | None:
+    cell = cell.strip()
+    if separator != ",":
+        cell = cell.replace(",", ".")
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def _column(table: Mapping[str, Array], names: Sequence[str], where: str) -> Array:
+    for name in names:
+        if name in table:
+            return table[name]
+    raise InputError(
+        f"{where} has no column {names[0]!r} (or {', '.join(names[1:])}). Found: {', '.join(table)}."
+    )
+
+
+def _voltage(table: Mapping[str, Array], phases: str | None, where: str) -> ComplexArray:
+    if "v_re" in table and "v_im" in table:
+        return table["v_re"] + 1j * table["v_im"]
+    for three in PHASE_NAMES:
+        if all(name in table for name in three):
+            if phases not in ("minimum", "mean"):
+                raise InputError(
+                    f"{where} has three phases {', '.join(three)}: say phases='minimum' or phases='mean'; "
+                    "the model is positive-sequence."
+                )
+            stacked = np.stack([table[name] for name in three])
+            return (stacked.min(axis=0) if phases == "minimum" else stacked.mean(axis=0)).astype(complex)
+    for name in MAGNITUDE_NAMES:
+        if name in table:
+            angle = next((table[a] for a in ANGLE_NAMES if a in table), None)
+            return table[name] * (1.0 if angle is None else np.exp(1j * np.deg2rad(angle))) + 0j
+    raise InputError(
+        f"{where} has no voltage column: v_re and v_im, or one of {', '.join(MAGNITUDE_NAMES)} (with angle_deg), "
+        f"or v_a, v_b and v_c. Found: {', '.join(table)}."
+    )

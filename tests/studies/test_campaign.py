@@ -1,0 +1,156 @@
+"""Campaigns: nothing is lost, nothing is done twice, one bad task spoils nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cloudpickle
+import pytest
+
+from dcvrt.errors import InputError
+from dcvrt.studies.campaign import Campaign, InProcess, Task, crew_of
+from dcvrt.studies.store import Store
+
+cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers do not have the tests
+
+
+def square(payload: dict) -> dict:
+    return {"n": payload["n"], "value": payload["n"] ** 2, "pid": os.getpid()}
+
+
+def fragile(payload: dict) -> dict:
+    if payload["n"] == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if payload["n"] == 5:
+        raise ValueError("five is not welcome")
+    if payload["n"] == 7:
+        time.sleep(60)
+    return square(payload)
+
+
+def tasks(count: int) -> list[Task]:
+    return [Task("squares", {"n": n}) for n in range(count)]
+
+
+def run(folder: Path, function, count: int, workers: int, **options) -> tuple[list[str], dict[int, int], list[int]]:
+    """Messages of lost tasks, results, tasks whose loss was recorded."""
+    results: dict[int, int] = {}
+    lost: list[int] = []
+    with Store(folder / "study.sqlite", write=True) as store, crew_of(workers) as crew:
+        campaign = Campaign(store, crew, **options)
+        messages = campaign.run("squares", tasks(count), function, lambda task, r: results.update({r["n"]: r["value"]}),
+                                lambda task, why: lost.append(task.payload["n"]))
+    return messages, results, sorted(lost)
+
+
+def test_a_task_is_keyed_by_what_it_says_not_by_how() -> None:
+    assert Task("a", {"x": 1, "y": [2.5]}).key == Task("a", {"y": [2.5], "x": 1}).key
+    assert Task("a", {"x": 1}).key != Task("b", {"x": 1}).key
+    assert Task("a", {"x": 1}).text == '{"x":1}'
+
+
+def test_finished_tasks_are_not_done_again(tmp_path: Path) -> None:
+    _, first, _ = run(tmp_path, square, 4, workers=1)
+    _, second, _ = run(tmp_path, square, 6, workers=1)
+    assert first == {0: 0, 1: 1, 2: 4, 3: 9}
+    assert second == {4: 16, 5: 25}
+
+
+def test_the_answer_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    _, one, _ = run(tmp_path / "one", square, 12, workers=1)
+    _, two, _ = run(tmp_path / "two", square, 12, workers=2)
+    assert one == two == {n: n**2 for n in range(12)}
+
+
+def test_a_raising_and_a_slow_task_are_set_aside_in_process(tmp_path: Path) -> None:
+    def gentle(payload: dict) -> dict:
+        return square(payload) if payload["n"] == 3 else fragile(payload)
+
+    messages, results, lost = run(tmp_path, gentle, 9, workers=1, timeout_s=0.3)
+    assert lost == [5, 7] and sorted(results) == [0, 1, 2, 3, 4, 6, 8]
+    assert [m.split(": ", 1)[1] for m in messages] == [
+        "failed: ValueError: five is not welcome", "timeout: took longer than 0.3 s"]
+
+
+def test_a_poison_task_is_quarantined_and_the_others_finish(tmp_path: Path) -> None:
+    messages, results, lost = run(tmp_path, fragile, 9, workers=2, timeout_s=8.0, tries=2)
+    assert lost == [3, 5, 7] and results == {n: n**2 for n in (0, 1, 2, 4, 6, 8)}
+    assert [m.split(": ", 1)[1] for m in messages] == [
+        "quarantined: its worker died 2 times while doing it", "failed: ValueError: five is not welcome",
+        "timeout: took longer than 8 s"]
+    again, results, _ = run(tmp_path, fragile, 9, workers=1, timeout_s=8.0, tries=2)
+    assert again == messages and results == {}, "what was set aside stays so, and is reported again"
+
+
+SLOW_RUN = """
+import sys, time
+from pathlib import Path
+from dcvrt.studies.campaign import Campaign, Task, crew_of
+from dcvrt.studies.store import Store
+
+def work(payload):
+    with open(payload["log"], "a") as log:
+        log.write(f"{payload['n']}\\n")
+    time.sleep(0.15)
+    return payload["n"]
+
+with Store(Path(sys.argv[1]) / "study.sqlite", write=True) as store, crew_of(int(sys.argv[2])) as crew:
+    def record(task, n):
+        store.put("hostings", [dict(name=f"{n:03}", role="sample", subset="", total_mw=n, by_site={})])
+    Campaign(store, crew).run("slow", [Task("slow", {"n": n, "log": sys.argv[3]}) for n in range(12)], work,
+                              record, lambda task, why: None)
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None:
+    script = tmp_path / "slow_run.py"
+    script.write_text(SLOW_RUN)
+    log = tmp_path / "log.txt"
+    command = [sys.executable, str(script), str(tmp_path), str(workers), str(log)]
+    first = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and (not log.exists() or len(log.read_text().split()) < 5):
+        time.sleep(0.02)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    with Store(tmp_path / "study.sqlite") as store:
+        assert store.integrity() == "ok"
+        done = set(store.hostings().name)
+    assert 0 < len(done) < 12, "the kill has to fall into the campaign"
+    begun = log.read_text().split()
+    subprocess.run(command, check=True, timeout=120, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    with Store(tmp_path / "study.sqlite") as store:
+        assert list(store.hostings().name) == [f"{n:03}" for n in range(12)]
+        assert (store.tasks().status == "done").all()
+    repeated = log.read_text().split()[len(begun):]
+    assert not {f"{int(n):03}" for n in repeated} & done, "a finished task was done again"
+
+
+def test_a_task_that_took_the_whole_process_down_too_often_is_not_started_again(tmp_path: Path) -> None:
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        store.add_tasks([(t.key, "squares", t.text) for t in tasks(2)])
+        store.count_attempt(tasks(1)[0].key, by=3)
+        messages = Campaign(store, InProcess(), tries=3).run("squares", tasks(2), square, lambda *_: None, lambda *_: None)
+    assert [m.split(": ", 1)[1] for m in messages] == ["quarantined: its worker died 3 times while doing it"]
+
+
+def test_no_workers_is_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        crew_of(0)
+    assert str(caught.value) == "workers = 0: needs at least 1."
+
+
+def test_a_scheduler_that_does_not_answer_is_named() -> None:
+    with pytest.raises(InputError) as caught, crew_of(2, "tcp://127.0.0.1:9"):
+        pass
+    assert str(caught.value) == (
+        "no dask scheduler answers at 'tcp://127.0.0.1:9' (OSError). "
+        "Way out: start one with 'dask scheduler' and give the address that it prints.")
