@@ -75,11 +75,11 @@ def gfm() -> Diagram:
     f.connect(vsm.v_dq, lim.v)
 
     slower = (
-        "illustrative: at the grid-following gain this loop is faster than the swing of the virtual machine that "
-        "it commands (about 43 rad/s), and the pair is unstable"
+        "illustrative: at the grid-following gain this loop is faster than the swing of the virtual machine "
+        "that it commands (about 110 rad/s), and the pair is unstable"
     )
-    f.set("dc_loop.K_p", 0.5, slower)
-    f.set("dc_loop.K_i", 2.0, slower)
+    f.set("dc_loop.K_p", 1.0, slower)
+    f.set("dc_loop.K_i", 5.0, slower)
     return f
 
 
@@ -87,11 +87,11 @@ def _double_conversion(name: str, doc: str) -> Diagram:
     """Everything but the grid-facing control: loads, DC link, battery, protected bus, limit, supervisor."""
     f = Diagram(name, doc)
     H = f.parameter("H", 1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
-    beta = f.parameter("beta", 1.15, "1", (0.8, 2.0), "converter rating over H", "illustrative: 1.0-1.5 studied")
+    beta = f.parameter("beta", 1.15, "1", (0.8, 2.0), "converter rating over H", "illustrative")
     d = f.parameter("d", 0.95, "1", (0.1, 1.2), "load factor: demand over H at g_it = 1", "illustrative")
     pf = f.parameter("pf", 0.98, "1", (0.8, 1.0), "power factor of the import, lagging", "illustrative")
-    pue = f.parameter("PUE", 1.3, "1", (1.0, 3.0), "facility over IT energy", "illustrative; 1.54 was the 2025 average")
-    k_cool = f.parameter("cooling_share", 0.74, "1", (0.0, 1.0), "cooling within the non-IT demand", "illustrative")
+    pue = f.parameter("PUE", 1.3, "1", (1.0, 3.0), "facility over IT energy", "illustrative; average 1.54")
+    k_cool = f.parameter("cooling_share", 0.74, "1", (0.0, 1.0), "cooling in non-IT demand", "illustrative")
 
     v = f.input("v_poi", "pu(V)", Phasor, rest=1.0, doc="POI voltage, positive sequence, network frame")
     g_it = f.input("g_it", "1", rest=1.0, doc="normalised IT load")
@@ -138,7 +138,7 @@ def _double_conversion(name: str, doc: str) -> Diagram:
     f.connect(poi.p, dc.p_g, bess.p_g)
     f.connect(poi.q, bus.q_g)
 
-    f.connect(dc.w, dc_loop.w, bess.w, bus.w, sup.w)
+    f.connect(dc.w, dc_loop.w, lim.w, bess.w, bus.w, sup.w)
     f.connect(dc.drain, dc_loop.p_ref, bess.drain)
     f.connect(bess.p, dc.p_b)
     f.connect(bus.v, psu.v_it)

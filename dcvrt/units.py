@@ -1,14 +1,14 @@
 """Units of symbols, and the per-unit kinds that must never mix.
 
 Per-unit numbers look alike whatever they measure, so that a voltage can be wired to a current without anyone
-noticing. dcvrt therefore writes the kind with the unit: ``pu(V)``, ``pu(I)``, ``pu(S)``, ``pu(Z)``. Two ports may
-be wired when their units are the same product of the same bases; nothing is converted silently.
+noticing. dcvrt therefore writes the kind with the unit: ``pu(V)``, ``pu(I)``, ``pu(S)``, ``pu(Z)``. Two ports
+may be wired when their units are the same product of the same bases; nothing is converted silently.
 """
 
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from functools import cache
 
 from dcvrt.errors import ModelError, did_you_mean
 
@@ -34,7 +34,7 @@ _FACTOR = re.compile(r"^(?P<base>pu\([A-Z]\)|[A-Za-z]+|1)(?P<power>-?\d+)?$")
 Dimension = tuple[tuple[str, int], ...]
 
 
-@lru_cache(maxsize=None)
+@cache
 def dimension(unit: str) -> Dimension:
     """Exponents of the bases of `unit`, sorted by base.
 
@@ -57,7 +57,9 @@ def dimension(unit: str) -> Dimension:
         for place, factor in enumerate(part.split()):
             match = _FACTOR.match(factor)
             if factor == "pu":
-                raise ModelError(f"unit {unit!r}: plain 'pu' does not say of what. Write pu(V), pu(I), pu(S) or pu(Z).")
+                raise ModelError(
+                    f"unit {unit!r}: plain 'pu' does not say of what. Write pu(V), pu(I), pu(S) or pu(Z)."
+                )
             if match is None or match["base"] not in BASES:
                 raise ModelError(f"unit {unit!r}: {factor!r} is not known.{did_you_mean(factor, BASES)}")
             power = int(match["power"] or 1) * (sign if place == 0 else 1)

@@ -59,15 +59,10 @@ class Pieces:
         c = self.coefficients[k]
         return c[..., 0] + s * (c[..., 1] + s * (c[..., 2] + s * c[..., 3]))
 
-    def split(self, times: Array) -> Pieces:
-        """Express the same function with further breakpoints at `times`; ends are not extended."""
-        end = self.start[-1] + self.length[-1]
-        inside = times[(times > self.start[0]) & (times < end)]
-        start = np.unique(np.concatenate([self.start, inside]))
-        stop = np.append(start[1:], end)
-        k = np.searchsorted(self.start, start, side="right") - 1
-        a = (start - self.start[k]) / self.length[k]
-        h = (stop - start) / self.length[k]
+    def on(self, start: Array, length: Array) -> NDArray[Any]:
+        """Coefficients of the same function on finer pieces, each of which lies in one piece of this."""
+        k = np.clip(np.searchsorted(self.start, start + length / 2, side="right") - 1, 0, len(self.start) - 1)
+        a, h = (start - self.start[k]) / self.length[k], length / self.length[k]
         c0, c1, c2, c3 = self.coefficients[k].T
         moved = (
             c0 + a * (c1 + a * (c2 + a * c3)),
@@ -75,9 +70,7 @@ class Pieces:
             h**2 * (c2 + 3 * a * c3),
             h**3 * c3,
         )
-        return Pieces(
-            start, stop - start, np.stack(moved, axis=1), self.after_jump[k] & (start == self.start[k])
-        )
+        return np.stack(moved, axis=1)
 
 
 def cubic_pieces(t: Array, v: NDArray[Any]) -> Pieces:

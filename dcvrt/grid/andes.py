@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
-import json
 import logging
 import os
 import shutil
@@ -14,7 +14,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,10 @@ POWER_FLOW_TOLERANCE = 1e-9
 """Largest mismatch, pu."""
 FLAT_START_TOLERANCE = 1e-6
 """Largest residual of any equation before the fault, pu."""
+SLACK_TOLERANCE = 1e-7
+"""Largest difference between the unit at the slack bus and its share, pu."""
+COLLAPSED = 0.01
+"""Voltage just after clearing, pu, below which the faulted bus counts as not recovered."""
 LOST_SYNCHRONISM = np.pi
 """Angle between a rotor and the centre of inertia, rad, from which on the rotor counts as out of step."""
 
@@ -161,9 +164,11 @@ def _quiet() -> Iterator[_Said]:
 
 def case118() -> Path:
     """Path of `case118.m` in the installed ANDES package."""
-    import andes
-
-    return Path(andes.__file__).parent / "cases" / "matpower" / "case118.m"
+    spec = importlib.util.find_spec("andes")  # located, not imported: importing it takes a second
+    if spec is None or spec.origin is None:
+        raise InputError("ieee118: the case file comes with the package 'andes', which is not installed. "
+                         "Way out: pip install andes.")
+    return Path(spec.origin).parent / "cases" / "matpower" / "case118.m"
 
 
 def read(path: Path, dynamics: Path | None = None) -> Any:
@@ -191,8 +196,11 @@ def read(path: Path, dynamics: Path | None = None) -> Any:
     return system
 
 
-def network(system: Any, name: str) -> Network:
-    """Network of an ANDES system that is set up, loads at their reference level."""
+def read_network(path: Path, dynamics: Path | None, name: str) -> Network:
+    """Read the network of a case file, loads at their reference level; see `read`."""
+    system = read(path, dynamics)
+    with _quiet():
+        system.setup()
     base = float(system.config.mva)
     bus, position = system.Bus, {idx: k for k, idx in enumerate(system.Bus.idx.v)}
     strange = [idx for idx in bus.idx.v if not isinstance(idx, (int, np.integer))]
@@ -282,35 +290,175 @@ class OperatingPoint:
             system.add("Fault", {"idx": idx, "bus": fault.bus, "tf": -1.0, "tc": -1.0, "xf": fault.x_f, "rf": fault.r_f})
         with _quiet() as said:
             system.setup()
+            if not system.SynGen.n:
+                raise InputError(f"{where}: the case has no dynamic data, not one machine. Way out: add a machine "
+                                 "(GENROU, GENCLS) for each generator, in a .dyr file given as dynamics=... or in the case itself.")
+            reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
             system.PQ.p0.v[:loads] *= load_scale
             system.PQ.q0.v[:loads] *= load_scale
-            self._power_flow(rule)
+            self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
             self._initialise(said)
 
     # -- power flow ----------------------------------------------------------------------------------------
 
-    def _power_flow(self, rule: str) -> None:
-        """Solve, and move the schedule until the slack unit too generates its share."""
-        system, flow = self.system, self.system.PFlow
-        flow.config.tol = POWER_FLOW_TOLERANCE
-        units, slack = (system.PV, system.Slack), system.Slack
-        p_set = np.concatenate([u.p0.v * u.u.v for u in units])
-        p_max = np.concatenate([np.where(u.pmax.v > 0, u.pmax.v, np.inf) for u in units])
-        demand = float(system.PQ.p0.v @ system.PQ.u.v)
-        total = float(p_set.sum())
-        if rule == "proportional":
-            total += demand - self._reference_demand()
-        for _ in range(20):
+    def _power_flow(self, rule: str, more: float) -> None:
+        """Solve for `more` load, pu; move the schedule until the unit at the slack bus generates its share too."""
+        system, slack = self.system, self.system.Slack
+        system.PFlow.config.tol = POWER_FLOW_TOLERANCE
+        units = (system.PV, slack)
+        p_set = np.concatenate([unit.p0.v * unit.u.v for unit in units])
+        p_max = np.concatenate([unit.pmax.v for unit in units])
+        total, surplus = float(p_set.sum()) + more, np.inf
+        while abs(surplus) > SLACK_TOLERANCE:
             if rule == "proportional":
-                p = redispatch.share(p_set, p_max, total)
-                system.PV.p0.v[:] = p[: system.PV.n]
+                p_set = redispatch.share(p_set, p_max, total)
+                system.PV.p0.v[:] = p_set[: system.PV.n]
             self._solve()
-            missing = float(slack.p.v.sum()) - (float(p[system.PV.n :].sum()) if rule == "proportional" else 0.0)
-            if rule == "slack" or abs(missing) < 1e-7:
-                break
-            total += missing
-        self.generation = np.concatenate([system.PV.p0.v, slack.p.v])
-        out = float(slack.p.v[0])
-        if not 0 <= out <= float(slack.pmax.v[0]):
-            raise SimulationError(f"{self.where}: the unit at slack bus {slack.bus.v[0]} would generate {100 * out:.0f} MW, "
-                                  f"outside 0 to {100 * float(slack.pmax.v[0]):.0f} MW. Way out: redispatch='proportional'.")
+            surplus = float(slack.p.v.sum() - p_set[system.PV.n :].sum()) if rule == "proportional" else 0.0
+            total += surplus
+        base = float(system.config.mva)
+        self.generation: dict[int, complex] = {}
+        for unit in units:
+            for bus, p, q in zip(unit.bus.v, unit.p.v, unit.q.v, strict=True):
+                self.generation[int(bus)] = self.generation.get(int(bus), 0j) + base * complex(p, q)
+        self.beyond_q_limits = tuple(
+            int(unit.bus.v[k]) for unit in units for k in np.flatnonzero((unit.q.v > unit.qmax.v) | (unit.q.v < unit.qmin.v)))
+        if not (0 <= slack.p.v).all() or not (slack.p.v <= slack.pmax.v).all():
+            raise SimulationError(f"{self.where}: the unit at slack bus {slack.bus.v[0]} would generate "
+                                  f"{base * slack.p.v[0]:.0f} MW, outside 0 to {base * slack.pmax.v[0]:.0f} MW. "
+                                  "Way out: redispatch='proportional', or host less.")
+
+    def _solve(self) -> None:
+        """One power flow."""
+        system = self.system
+        system.PFlow.run()
+        if system.PFlow.converged:
+            return
+        bus = system.Bus
+        mismatch = np.hypot(system.dae.g[bus.a.a], system.dae.g[bus.v.a])
+        worst = int(np.argmax(np.nan_to_num(mismatch, nan=np.inf)))
+        raise SimulationError(f"{self.where}: power flow has no solution; the largest mismatch, "
+                              f"{mismatch[worst] * float(system.config.mva):.3g} MVA, is at bus {bus.idx.v[worst]}. "
+                              "Way out: host less there, or check load_scale and the voltage set points.")
+
+    # -- initialisation ------------------------------------------------------------------------------------
+
+    def _initialise(self, said: _Said) -> None:
+        """Initialise all dynamic devices, and refuse a start that is not an equilibrium within every limit."""
+        system, tds = self.system, self.system.TDS
+        limits = [(model, limit) for model in system.exist.tds.values() if model.n for part in model.discrete.values()
+                  for limit in (getattr(part, "lower", None), getattr(part, "upper", None)) if hasattr(limit, "vin")]
+        before = [np.array(limit.v, dtype=float) for _, limit in limits]
+        tds.config.no_tqdm = 1
+        tds.config.criteria = 0
+        tds.init()
+        if not tds.initialized:
+            raise SimulationError(f"{self.where}: ANDES could not initialise the dynamic devices. {said}")
+        moved = []
+        for (model, limit), value in zip(limits, before, strict=True):
+            moved += [f"{model.class_name} '{model.idx.v[k]}': {limit.name} = {value[k]:.4g} pu, but {limit.v[k]:.4g} pu is needed"
+                      for k in np.flatnonzero(limit.v != value)]
+        if moved:
+            more = f"; and {len(moved) - 4} more" if len(moved) > 4 else ""
+            raise SimulationError(f"{self.where}: {len(moved)} limit(s) are exceeded before the fault: {'; '.join(moved[:4])}{more}. "
+                                  "ANDES would widen them and say nothing. Way out: host less, or give the unit a wider limit.")
+        residual = np.abs(system.dae.fg)
+        worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
+        if not residual[worst] <= FLAT_START_TOLERANCE:
+            raise SimulationError(f"{self.where}: the start is no equilibrium; the largest residual, {residual[worst]:.3g} pu, is "
+                                  f"that of {system.dae.xy_name[worst]}. {said}".rstrip())
+        self.residual = float(residual[worst])
+
+    @property
+    def v0(self) -> Phasors:
+        """Bus voltages before the fault, pu, in the order of the buses."""
+        bus = self.system.Bus
+        y = self.system.TDS._y_t0
+        return np.asarray(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
+
+    # -- faults --------------------------------------------------------------------------------------------
+
+    def simulate(self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
+        """Voltages at `buses` on the times of the three stretches before, in and after the fault.
+
+        Parameters
+        ----------
+        fault : BusFault
+            One of those the operating point was made for.
+        times : three arrays
+            The first ends where the second begins, and so on; both sides of a jump are returned.
+
+        Returns
+        -------
+        v : complex array (times, buses)
+            Up to the time reached.
+        status : str
+            Empty when the end was reached, else the sentence that says what happened.
+        """
+        with _quiet():
+            return self._simulate(fault, times, buses)
+
+    def _simulate(self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
+        system = self.system
+        system.TDS.reinit()
+        address = [list(system.Bus.idx.v).index(bus) for bus in buses]
+        magnitude, angle = system.Bus.v.a[address], system.Bus.a.a[address]
+        device = system.Fault.idx2uid(self.fault_index[fault])
+        faulted = list(system.Bus.idx.v).index(fault.bus)
+        samples: list[Phasors] = []
+
+        def record() -> None:
+            y = system.dae.y
+            samples.append(y[magnitude] * np.exp(1j * y[angle]))
+
+        for _ in times[0]:  # an equilibrium, checked in `_initialise`: nothing moves before the fault
+            record()
+        stepper = Stepper(system)
+        stepper.t = fault.start
+        rotor = _Rotors(system)
+        before = system.dae.y.copy()
+        what = "inception"
+        try:
+            for what, on, stretch in (("inception", 1.0, times[1]), ("clearing", 0.0, times[2])):
+                system.Fault.uf.v[device] = on
+                # In polar form V = 0 solves the balance of a bus without load, so that a search which starts from the
+                # voltages of the fault ends there: the fault would never be cleared. Start from those before it.
+                stepper.event(before)
+                if not on and system.Bus.v.v[faulted] < COLLAPSED:
+                    raise NoConvergence(fault.cleared_at, f"the voltage at bus {fault.bus}")
+                record()
+                for t in stretch[1:]:
+                    stepper.advance(float(t))
+                    record()
+                    lost = rotor.out_of_step()
+                    if lost:
+                        return np.array(samples), f"lost synchronism at t = {t:.3f} s: {lost}."
+        except NoConvergence as failure:
+            v = system.Bus.v.v
+            low = int(np.argmin(v))
+            return np.array(samples), (
+                f"voltage collapse or numerical failure after {what} at t = {failure.t:.4f} s: the equations have no "
+                f"solution near the last one; {failure.variable} did not settle; lowest voltage {v[low]:.2f} pu at bus "
+                f"{system.Bus.idx.v[low]}.")
+        finally:
+            self.iterations, self.factorisations = stepper.iterations, stepper.factorisations
+        return np.array(samples), ""
+
+
+class _Rotors:
+    """Rotor angles of all machines against their centre of inertia."""
+
+    def __init__(self, system: Any) -> None:
+        models = [model for model in system.SynGen.models.values() if model.n]
+        self.system = system
+        self.address = np.concatenate([model.delta.a for model in models])
+        self.inertia = np.concatenate([model.M.v * model.ue.v for model in models])
+        self.name = [f"{model.class_name} '{idx}'" for model in models for idx in model.idx.v]
+        self.on = self.inertia > 0
+
+    def out_of_step(self) -> str:
+        """The machine that is furthest from the centre of inertia, when that is half a turn or more."""
+        delta = self.system.dae.x[self.address]
+        away = np.where(self.on, np.abs(delta - delta @ self.inertia / self.inertia.sum()), 0.0)
+        k = int(np.argmax(away))
+        return f"{self.name[k]} is {np.rad2deg(away[k]):.0f} deg from the centre of inertia" if away[k] > LOST_SYNCHRONISM else ""

@@ -274,10 +274,11 @@ class PowerFlow:
         order = np.argsort(s[self.pq].real.sum(axis=0), kind="stable")
         return [g for g in np.array_split(order, min(8, max(1, len(order) // 64))) if len(g)]
 
-    def _inverse(self, v: Phasors) -> Floats:
-        return np.linalg.inv(self._jacobian(v).toarray())
+    def _inverse(self, v: Phasors) -> npt.NDArray[np.float32]:
+        """Inverse Jacobian at one point, in single precision: it only steers, the residuals are exact."""
+        return np.linalg.inv(self._jacobian(v).toarray()).astype(np.float32)
 
-    def _chord(self, s: Phasors, start: Phasors, inverse: Floats, steps: int) -> tuple[Phasors, Floats, Integers]:
+    def _chord(self, s: Phasors, start: Phasors, inverse: npt.NDArray[np.float32], steps: int) -> tuple[Phasors, Floats, Integers]:
         """Newton with one inverse for all columns; columns that are done leave the loop."""
         n, count = len(self.free), s.shape[1]
         v = start.copy()
@@ -296,7 +297,7 @@ class PowerFlow:
                     break
                 if going.mean() < 0.7:
                     todo, size, angle, rest = todo[going], size[:, going], angle[:, going], rest[:, going]
-                move = inverse @ rest
+                move = inverse @ rest.astype(np.float32)
                 angle[self.free] -= move[:n]
                 size[self.pq] -= move[n:]
         return v, worst, row
@@ -330,6 +331,7 @@ class PowerFlow:
             for j, direction in enumerate(directions / self.network.base_mva):
                 base = np.r_[direction[self.free].real, direction[self.pq].imag]
                 right = np.outer(base, scale[group])
+                size = abs(right).max()
                 x = np.outer(inverse @ base, scale[group])
                 for _ in range(60):
                     dv = np.zeros_like(vg)
@@ -337,9 +339,9 @@ class PowerFlow:
                     dv[self.pq] += ug[self.pq] * x[n:]
                     power = dv * ig + vg * (self._y @ dv).conj()
                     rest = np.concatenate([power[self.free].real, power[self.pq].imag]) - right
-                    if abs(rest).max() <= 1e-10 * abs(right).max():
+                    if abs(rest).max() <= 1e-10 * size:
                         break
-                    x -= inverse @ rest
+                    x -= size * (inverse @ (rest / size).astype(np.float32))  # scaled: single precision underflows
                 else:
                     raise SimulationError(f"{self.network.name}: voltage sensitivities did not settle; the operating "
                                           "points lie close to the limit of power transfer. Way out: host less.")

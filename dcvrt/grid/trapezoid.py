@@ -4,13 +4,12 @@ r"""Implicit trapezoidal rule on the equations of a loaded ANDES system.
     T \dot x = f(x, y), \quad 0 = g(x, y), \qquad
     T (x_{n+1} - x_n) = \tfrac{h}{2} (f_{n+1} + f_n), \quad g_{n+1} = 0
 
-ANDES evaluates `f`, `g`, their Jacobian and its limiters; only the stepping is ours, for three reasons.
+ANDES evaluates `f`, `g`, their Jacobian and its limiters; only the stepping is ours, for two reasons.
 
-* ANDES's own loop finds an event by comparing floating-point times. With some step sizes it passes the clearing
-  time without clearing the fault, and says nothing.
-* It averages `f` over the jump. Here an event is its own algebraic solution: `x` stays, `g = 0` gives the voltages
-  on the other side, and the next step starts from the `f` of that side. Both sides of a jump are exact.
-* It leaves the rows of states at a limit in the Jacobian and refreshes that by the clock, which takes 5 to 10
+* Exact events. ANDES steps 0.1 ms across an event and averages `f` over the jump. Here an event is its own algebraic
+  solution: `x` stays, `g = 0` gives the voltages on the other side, and the next step starts from the `f` of that
+  side. Against ANDES's own loop at 1/480 s the voltages differ by about 1e-4 pu.
+* Cost. ANDES leaves the rows of states at a limit in the Jacobian and refreshes that by the clock, which takes 4 to 10
   iterations a step. Here a state at its limit has a unit row, and the factors are kept while they contract well.
 
 Every step is as long as asked, so that all simulations of a study share one time layout. A step that does not
@@ -27,8 +26,8 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-TOLERANCE = 1e-7
-"""Largest last correction of any state or algebraic variable, pu or rad."""
+TOLERANCE = 1e-6
+"""Largest last correction of any state or algebraic variable, pu or rad; the error left is smaller by `SLOW`."""
 ITERATIONS = 12
 EVENT_ITERATIONS = 60
 SLOW = 0.2
@@ -143,9 +142,12 @@ class Stepper:
 
     # -- what is called ------------------------------------------------------------------------------------
 
-    def event(self) -> None:
-        """Re-solve the algebraic equations at once, after something in the network has changed."""
+    def event(self, guess: Floats) -> None:
+        """Re-solve the algebraic equations at once from `guess`, after something in the network has changed."""
         self._factored = (-1.0, ())
+        self.dae.y[:] = guess
+        self.system.vars_to_models()
+        self.evaluate(0)
         self._newton(0.0, EVENT_ITERATIONS, TOLERANCE)
 
     def advance(self, until: float) -> None:

@@ -102,11 +102,11 @@ class Go:
     source: str
     target: str
     when: Guard
-    held: Scalar = 0.0
+    held: Scalar = 0
     reset: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        timed = "" if str(self.held) in ("0", "0.0") else f" held {self.held}"
+        timed = "" if str(self.held) == "0" else f" held {self.held}"
         return f"{self.source} -> {self.target}: {self.when}{timed}"
 
 
@@ -132,7 +132,8 @@ def check_table(modes: Sequence[str], start: str, rows: Sequence[Go]) -> list[st
     stuck = [mode for mode in modes if not any(row.source == mode for row in rows)]
     if unreached:
         problems.append(
-            f"mode(s) never entered from {start}: {', '.join(unreached)}. Add a row that leads there or drop the mode."
+            f"mode(s) never entered from {start}: {', '.join(unreached)}. "
+            "Add a row that leads there or drop the mode."
         )
     if stuck:
         problems.append(f"mode(s) without a way out: {', '.join(stuck)}. Add a row that leaves them.")
@@ -162,15 +163,21 @@ def check_hysteresis(rows: Sequence[Go], value: Callable[[Scalar], float]) -> li
 
     def apart(one: Box, other: Box) -> bool:
         return any(
-            one[signal][0] > other[signal][1] or other[signal][0] > one[signal][1] for signal in one.keys() & other.keys()
+            one[signal][0] > other[signal][1] or other[signal][0] > one[signal][1]
+            for signal in one.keys() & other.keys()
         )
 
     problems = []
     for there, back in itertools.combinations(rows, 2):
-        if (there.source, there.target) != (back.target, back.source) or () in there.when.cases + back.when.cases:
+        if (there.source, there.target) != (
+            back.target,
+            back.source,
+        ) or () in there.when.cases + back.when.cases:
             continue
         if not all(apart(a, b) for a in boxes(there.when) for b in boxes(back.when)):
-            limits = {str(c.limit): value(c.limit) for row in (there, back) for case in row.when.cases for c in case}
+            limits = {
+                str(c.limit): value(c.limit) for row in (there, back) for case in row.when.cases for c in case
+            }
             values = ", ".join(f"{name} = {number:g}" for name, number in limits.items())
             problems.append(
                 f"'{there}' and '{back}' leave no gap between them ({values}): the modes would chatter. "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dcvrt.models import smooth
-from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
+from dcvrt.models.block import Block, Equations, Input, Parameter, State
 
 
 class Bess(Block):
@@ -18,8 +18,9 @@ class Bess(Block):
     .. math::
         T_b \dot P^b = P^\star - P^b, \qquad \dot s = -P^b / (T_E H)
 
-    Discharge positive. Flags: a (assist), the mismatch between load and grid power is fed forward; c (charge),
-    the battery is brought back to s*. :math:`\chi_0, \chi_1` fall from 1 to 0 over the last `fade` of charge.
+    Discharge positive. Flags: a (assist), the mismatch between load and grid power is fed forward; c
+    (charge), the battery is brought back to s*. :math:`\chi_0, \chi_1` fall from 1 to 0 over the last
+    `fade` of charge.
     Equilibrium: w = 1, P_b = 0, s = s*.
     Differs: the paper tells in words that the battery acts on the DC voltage and on the power mismatch; the
     law, its deadband and its limits are ours. The deadband leaves small errors to the grid converter.
@@ -27,7 +28,7 @@ class Bess(Block):
 
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
     T_b = Parameter(0.01, "s", (1e-3, 0.2), "lag of the battery converter", "illustrative: 2-12 ms")
-    P_dis = Parameter(1.2, "1", (0.0, 3.0), "discharge limit over H", "illustrative: carries the whole load alone")
+    P_dis = Parameter(1.2, "1", (0.0, 3.0), "discharge limit over H", "illustrative: carries the whole load")
     P_ch = Parameter(0.1, "1", (0.0, 3.0), "charge limit over H", "illustrative")
     K_b = Parameter(8.0, "1", (0.0, 100.0), "support gain over H per DC energy error", "illustrative")
     w_b = Parameter(0.03, "1", (0.0, 0.3), "deadband of the DC energy error", "illustrative")

@@ -18,12 +18,11 @@ from dcvrt.models.automaton import Go
 from dcvrt.models.phasor import Phasor, Scalar
 from dcvrt.units import dimension
 
-
 RESERVED = {"values", "sources", "clock", "mode"}
 """Names that mean something to every block, beside those of the class."""
 
 
-class UnknownName(ModelError, AttributeError):
+class UnknownNameError(ModelError, AttributeError):
     """A symbol or port that the block does not declare."""
 
 
@@ -45,7 +44,7 @@ class Declared:
 
 @dataclass(eq=False)
 class Parameter(Declared):
-    """A constant of the block: value, unit, range it may be set in, meaning, and where the value comes from."""
+    """A constant of the block: value, unit, range it may be set in, meaning, source of the value."""
 
     value: float = 0.0
     bounds: tuple[float, float] = (-inf, inf)
@@ -137,7 +136,7 @@ class Namespace(SimpleNamespace):
 
     def __getattr__(self, name: str) -> Any:
         known = [k for k in vars(self) if not k.startswith("_")]
-        raise UnknownName(f"{self._owner} has no symbol or value {name!r}.{did_you_mean(name, known)}")
+        raise UnknownNameError(f"{self._owner} has no symbol or value {name!r}.{did_you_mean(name, known)}")
 
 
 D = TypeVar("D", bound=Declared)
@@ -168,7 +167,10 @@ class Block:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls._declared = {
-            name: d for base in reversed(cls.__mro__) for name, d in vars(base).items() if isinstance(d, Declared)
+            name: d
+            for base in reversed(cls.__mro__)
+            for name, d in vars(base).items()
+            if isinstance(d, Declared)
         }
         problems = []
         for name, d in cls._declared.items():
@@ -212,7 +214,7 @@ class Block:
         if name.startswith("__"):
             raise AttributeError(name)
         who = f"{self.name} ({type(self).__name__})" if self.name else type(self).__name__
-        raise UnknownName(f"{who} has no {name!r}.{did_you_mean(name, self._declared)}")
+        raise UnknownNameError(f"{who} has no {name!r}.{did_you_mean(name, self._declared)}")
 
     # ---- what a subclass gives -------------------------------------------------------------------------
 
@@ -240,22 +242,28 @@ class Block:
         """
         mode = values.pop("mode", self.start)
         known = {*self._declared, *self.flags, "clock"}
-        problems = [f"there is no {name!r}.{did_you_mean(name, known)}" for name in values if name not in known]
+        problems = [
+            f"there is no {name!r}.{did_you_mean(name, known)}" for name in values if name not in known
+        ]
         raise_all(problems, type(self).__name__, InputError)
         given = dict(self.values)
         if self.modes:
-            given |= {flag: column[self.modes.index(mode)] for flag, column in self.flags.items()} | {"clock": 0.0}
+            given |= {flag: column[self.modes.index(mode)] for flag, column in self.flags.items()} | {
+                "clock": 0.0
+            }
         return Namespace(_owner=type(self).__name__, **(given | values))
 
     def symbols(self, path: str) -> Namespace:
-        """One CasADi symbol for every declared name but the outputs, and for flags and clock of a block with modes."""
+        """CasADi symbols for everything declared but the outputs, and for the flags and the clock."""
 
         def symbol(name: str, kind: type) -> Any:
             if kind is Phasor:
                 return Phasor(ca.SX.sym(f"{path}.{name}.re"), ca.SX.sym(f"{path}.{name}.im"))
             return ca.SX.sym(f"{path}.{name}")
 
-        table = {name: symbol(name, d.kind) for name, d in self._declared.items() if not isinstance(d, Output)}
+        table = {
+            name: symbol(name, d.kind) for name, d in self._declared.items() if not isinstance(d, Output)
+        }
         if self.modes:
             table |= {name: symbol(name, float) for name in (*self.flags, "clock")}
         return Namespace(_owner=f"{path} ({type(self).__name__})", **table)
@@ -291,9 +299,13 @@ def check_equations(path: str, block: Block, eq: Any) -> list[str]:
             if name not in given:
                 problems.append(f"{who}: no equation for {what} {name!r}.")
             elif (wanted[name].kind is Phasor) != isinstance(given[name], Phasor):
-                problems.append(f"{who}: {what} {name!r} is declared as {wanted[name].kind.__name__}, "
-                                f"but its equation gives {type(given[name]).__name__}.")
+                problems.append(
+                    f"{who}: {what} {name!r} is declared as {wanted[name].kind.__name__}, "
+                    f"but its equation gives {type(given[name]).__name__}."
+                )
         for name in given:
             if name not in wanted:
-                problems.append(f"{who}: equation for {what} {name!r}, which is not declared.{did_you_mean(name, wanted)}")
+                problems.append(
+                    f"{who}: equation for {what} {name!r}, which is not declared.{did_you_mean(name, wanted)}"
+                )
     return problems

@@ -21,7 +21,13 @@ class Cooling(Block):
     rho = Parameter(0.6, "1", (0.0, 1.5), "how far cooling follows the servers", "illustrative: 0.3-0.6")
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
     d = Parameter(1.0, "1", (0.0, 1.2), "load factor: facility demand over hosted capacity at g = 1")
-    share = Parameter(0.17, "1", (0.0, 1.0), "share of the demand at g = 1", "PUE 1.3, three quarters of the rest: illustrative")
+    share = Parameter(
+        0.17,
+        "1",
+        (0.0, 1.0),
+        "share of the demand at g = 1",
+        "PUE 1.3, three quarters of the rest: illustrative",
+    )
 
     g_it = Input("1", "normalised IT load")
     p = Output("pu(S)", "cooling power")

@@ -20,7 +20,9 @@ class CurrentLag(Block):
     differ in control only.
     """
 
-    tau = Parameter(4e-3, "s", (1e-4, 0.1), "time constant of the closed current loop", "illustrative: 1-10 ms")
+    tau = Parameter(
+        4e-3, "s", (1e-4, 0.1), "time constant of the closed current loop", "illustrative: 1-10 ms"
+    )
 
     ask = Input("pu(I)", "current reference, dq frame", kind=Phasor)
     delta = Input("rad", "angle of the dq frame")

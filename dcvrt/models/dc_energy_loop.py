@@ -33,10 +33,13 @@ class DcEnergyLoop(Block):
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
     beta = Parameter(1.15, "1", (0.5, 3.0), "converter rating over hosted capacity", "illustrative")
     pf = Parameter(0.98, "1", (0.8, 1.0), "power factor of the import, lagging", "illustrative")
-    K_p = Parameter(4.0, "1", (0.01, 100.0), "proportional gain over H",
-                    "illustrative: K_p / T_hold = 133 1/s, about half of the current loop's bandwidth")  # fmt: skip
+    K_p = Parameter(
+        4.0, "1", (0.01, 100.0), "proportional gain over H", "illustrative, see facility"
+    )
     K_i = Parameter(20.0, "1/s", (0.0, 1000.0), "integral gain over H", "illustrative")
-    eps = Parameter(1e-3, "1", (1e-6, 0.1), "smoothing width of limits and gate, over H", "own choice: numerics")
+    eps = Parameter(
+        1e-3, "1", (1e-6, 0.1), "smoothing width of limits and gate, over H", "own choice: numerics"
+    )
     eps_v = Parameter(1e-3, "pu(V)", (1e-6, 0.1), "rounding of |V| at 0", "own choice: numerics")
 
     w = Input("1", "DC energy over its nominal value")

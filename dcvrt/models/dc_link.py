@@ -21,8 +21,12 @@ class DcLink(Block):
     """
 
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
-    T_hold = Parameter(0.03, "s", (1e-3, 1.0), "nominal energy over H: hold-up time", "illustrative: 20-30 ms")
-    eta = Parameter(1.0, "1", (0.8, 1.0), "efficiency from the link to the protected bus", "PUE counts the losses")
+    T_hold = Parameter(
+        0.03, "s", (1e-3, 1.0), "nominal energy over H: hold-up time", "illustrative: 20-30 ms"
+    )
+    eta = Parameter(
+        1.0, "1", (0.8, 1.0), "efficiency from the link to the protected bus", "PUE counts the losses"
+    )
 
     p_g = Input("pu(S)", "power from the grid")
     p_b = Input("pu(S)", "power from the battery")

@@ -15,8 +15,8 @@ from dcvrt.models.phasor import Scalar
 from dcvrt.units import dimension
 
 End = tuple[str, str]
-"""Block name and port name; the block name is empty for an input of the diagram. Wires hold names, not objects,
-so that `replace` keeps them."""
+"""Block name and port name; the block name is empty for an input of the diagram. Wires hold names, not
+objects, so that `replace` keeps them."""
 
 B = TypeVar("B", bound=Block)
 
@@ -47,8 +47,8 @@ class Shared:
 class Diagram:
     """Blocks and wires under one name.
 
-    Nothing is checked until `compile`, which reports every structural error at once; values given to `set` and
-    names looked up are checked on the spot.
+    Nothing is checked until `compile`, which reports every structural error at once; values given to `set`
+    and names looked up are checked on the spot.
 
     >>> from dcvrt.models import Diagram, Phasor, Pll
     >>> d = Diagram("mine")
@@ -76,11 +76,14 @@ class Diagram:
     def add(self, name: str, block: B) -> B:
         """Add a block under a name, and return it."""
         if name in self.blocks or name in self.shared or name in self.inputs:
-            self.problems.append(f"the name {name!r} is taken. Add the second {type(block).__name__} under another.")
+            self.problems.append(
+                f"the name {name!r} is taken. Add the second {type(block).__name__} under another."
+            )
             return block
         if block.name:
             self.problems.append(
-                f"the block added as {name!r} is already {block.name!r} of a diagram. Make a second {type(block).__name__}()."
+                f"the block added as {name!r} is already {block.name!r} of a diagram. "
+                f"Make a second {type(block).__name__}()."
             )
             return block
         block.name = name
@@ -107,8 +110,10 @@ class Diagram:
         self.shared[name] = Shared(ca.SX.sym(name), declared)
         return self.shared[name].symbol
 
-    def input(self, name: str, unit: str, kind: type = float, rest: complex | None = None, doc: str = "") -> Port:
-        """An input of the whole diagram; `rest` is its value before anything happens (phasor: 1, number: 0)."""
+    def input(
+        self, name: str, unit: str, kind: type = float, rest: complex | None = None, doc: str = ""
+    ) -> Port:
+        """An input of the whole diagram; `rest` is its value before anything happens (phasor 1, number 0)."""
         dimension(unit)
         declared = Input(unit, doc, kind=kind)
         declared.name = name
@@ -138,17 +143,21 @@ class Diagram:
         """
         origin = self._end(source)
         if not targets:
-            self.problems.append(f"connect({source}) names no input to feed. Write connect(source, target, ...).")
+            self.problems.append(
+                f"connect({source}) names no input to feed. Write connect(source, target, ...)."
+            )
         for target in targets:
             end = self._end(target)
             if origin is None or end is None:
                 continue
             if not isinstance(target.declared, Input) or target.block is None:
-                self.problems.append(f"{target} is not an input of a block. Write connect(source, target, ...).")
+                self.problems.append(
+                    f"{target} is not an input of a block. Write connect(source, target, ...)."
+                )
             elif end in self.wires:
                 self.problems.append(
-                    f"{target} is already driven by {path_of(self.wires[end].source)}; {source} cannot drive it too. "
-                    "Drop one of the two, or add them in a block."
+                    f"{target} is already driven by {path_of(self.wires[end].source)}; {source} cannot "
+                    "drive it too. Drop one of the two, or add them in a block."
                 )
             else:
                 self.wires[end] = Wire(origin, implicit, start)
@@ -165,7 +174,9 @@ class Diagram:
         """Put another block in the place of one: wires and bindings stay, its own values come with it."""
         self._known_block(name)
         if block.name:
-            raise ModelError(f"the block is already {block.name!r} of a diagram. Make a new {type(block).__name__}().")
+            raise ModelError(
+                f"the block is already {block.name!r} of a diagram. Make a new {type(block).__name__}()."
+            )
         block.name = name
         self.blocks[name].name = ""
         self.blocks[name] = block
@@ -177,7 +188,7 @@ class Diagram:
         Raises
         ------
         InputError
-            the name is not known, the value is outside its bounds, or the parameter is bound to an expression.
+            the name is not known, the value is outside its bounds, or the parameter is bound.
         """
         if path in self.shared:
             declared = self.shared[path].declared
@@ -188,7 +199,10 @@ class Diagram:
             return
         block_name, _, symbol = path.partition(".")
         if not symbol or block_name not in self.blocks:
-            known = [*self.shared, *(f"{n}.{k}" for n, b in self.blocks.items() for k in b.declared(Parameter))]
+            known = [
+                *self.shared,
+                *(f"{n}.{k}" for n, b in self.blocks.items() for k in b.declared(Parameter)),
+            ]
             raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, known)}")
         block = self.blocks[block_name]
         if (block_name, symbol) in self.bindings:
@@ -237,7 +251,9 @@ class Diagram:
 
     def _end(self, port: Any) -> End | None:
         if not isinstance(port, Port):
-            self.problems.append(f"{port!r} is not a port. Take ports from blocks (pll.delta) or from input().")
+            self.problems.append(
+                f"{port!r} is not a port. Take ports from blocks (pll.delta) or from input()."
+            )
             return None
         if port.block is None:
             known = self.inputs.get(port.declared.name)
@@ -246,7 +262,9 @@ class Diagram:
                 return None
             return ("", port.declared.name)
         if self.blocks.get(port.block.name) is not port.block:
-            self.problems.append(f"{port} belongs to a block that is not in this diagram. Add the block first.")
+            self.problems.append(
+                f"{port} belongs to a block that is not in this diagram. Add the block first."
+            )
             return None
         return (port.block.name, port.declared.name)
 

@@ -43,7 +43,9 @@ class AuxiliaryLoad(Block):
 
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), H_DOC)
     d = Parameter(1.0, "1", (0.0, 1.2), D_DOC)
-    share = Parameter(0.06, "1", (0.0, 1.0), "share of the demand at g = 1", "PUE 1.3, a quarter of the rest: illustrative")
+    share = Parameter(
+        0.06, "1", (0.0, 1.0), "share of the demand at g = 1", "PUE 1.3, a quarter of the rest: illustrative"
+    )
 
     p = Output("pu(S)", "auxiliary demand")
 

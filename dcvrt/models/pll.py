@@ -23,7 +23,9 @@ class Pll(Block):
     :math:`\zeta = \tfrac{1}{2} K_p \sqrt{V / K_i}`.
     """
 
-    K_p = Parameter(60.0, "rad/s/pu(V)", (1.0, 500.0), "proportional gain", "illustrative: damping 0.8 at 6 Hz")
+    K_p = Parameter(
+        60.0, "rad/s/pu(V)", (1.0, 500.0), "proportional gain", "illustrative: damping 0.8 at 6 Hz"
+    )
     K_i = Parameter(1400.0, "rad/s2/pu(V)", (0.0, 5e4), "integral gain", "illustrative: damping 0.8 at 6 Hz")
 
     v = Input("pu(V)", "POI voltage, network frame", kind=Phasor)

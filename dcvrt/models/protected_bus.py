@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dcvrt.models import smooth
-from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
+from dcvrt.models.block import Block, Equations, Input, Parameter, State
 
 
 class ProtectedBus(Block):
@@ -15,8 +15,8 @@ class ProtectedBus(Block):
         T_v \dot V = \min\!\left( V_{set} - k_{line} [1 - V_f]_+,\;
             \frac{\sqrt{(\beta H)^2 - Q_g^2}\; \mathit{pf}}{P^{out}},\; m_{max} \sqrt{w} \right) - V
 
-    The three limits are: the set point, which a sag pulls down by k_line; the apparent-power headroom that the
-    output stage shares with the grid side; the voltage that the DC link can modulate.
+    The three limits are: the set point, which a sag pulls down by k_line; the apparent-power headroom that
+    the output stage shares with the grid side; the voltage that the DC link can modulate.
     Equilibrium: V = V_set while headroom and DC link suffice.
     Differs: the paper names an output stage and gives no equation; this is ours, the same in both modes.
     """
@@ -29,7 +29,9 @@ class ProtectedBus(Block):
     m_max = Parameter(1.15, "pu(V)", (1.0, 1.5), "highest voltage at nominal DC energy", "illustrative")
     T_v = Parameter(5e-3, "s", (5e-4, 0.1), "lag of the output stage", "illustrative: 2-12 ms")
     eps = Parameter(1e-3, "pu(V)", (1e-6, 0.1), "smoothing width", "own choice: numerics")
-    eps_s = Parameter(1e-3, "1", (1e-6, 0.1), "smoothing width of the headroom, over H", "own choice: numerics")
+    eps_s = Parameter(
+        1e-3, "1", (1e-6, 0.1), "smoothing width of the headroom, over H", "own choice: numerics"
+    )
 
     w = Input("1", "DC energy over its nominal value")
     v_f = Input("pu(V)", "measured POI voltage")

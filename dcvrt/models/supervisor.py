@@ -23,7 +23,7 @@ class Supervisor(Block):
     Paper: fig. (ups_modes).
     It acts on the measured voltage and on the DC energy. The outputs are numbers that the modes set; the ramp
     of RETURN is the time in the mode over T_ramp.
-    Differs: thresholds and dwell times are not printed in the paper; ours are parameters, labelled illustrative.
+    Differs: thresholds and dwell times are not printed in the paper; ours are illustrative parameters.
     Differs: RETURN needs the control frame to be aligned with the voltage (|error| < e_sync), the
     resynchronisation that the paper names.
     """

@@ -28,7 +28,8 @@ class Vsm(Block):
         m = \operatorname{step}(i_p^u - I_{max})
 
     .. math::
-        \tau_E \dot E = \operatorname{sat}_{[E_{min}, E_{max}]}\!\left(E_0 + K_Q \frac{Q^g - Q^c}{H}\right) - E, \qquad
+        \tau_E \dot E = \operatorname{sat}_{[E_{min}, E_{max}]}\!
+            \left(E_0 + K_Q \frac{Q^g - Q^c}{H}\right) - E, \qquad
         T_0 \dot E_0 = h\, \frac{Q^u - Q^c}{H}
 
     Import positive, hence the sign of the swing equation. `delta` is the angle to the network frame at
@@ -44,18 +45,30 @@ class Vsm(Block):
     """
 
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity, the base of the impedance")
-    H_v = Parameter(0.5, "s", (0.01, 10.0), "virtual inertia", "illustrative")
-    D = Parameter(60.0, "1", (0.0, 500.0), "damping", "illustrative: damping 0.7 of the swing at full load")
+    H_v = Parameter(
+        0.075, "s", (0.01, 10.0), "virtual inertia", "as a droop with a 5 ms power filter, ANDES REGF1"
+    )
+    D = Parameter(
+        30.0, "1", (0.0, 500.0), "damping: power over frequency", "as a droop of 0.033, ANDES REGF1"
+    )
     R_v = Parameter(0.02, "pu(V)/pu(I)", (0.0, 0.5), "virtual resistance on H", "illustrative")
-    X_v = Parameter(0.2, "pu(V)/pu(I)", (0.02, 1.0), "virtual reactance on H", "PSID test data; ANDES REGF1 xf")
+    X_v = Parameter(
+        0.2, "pu(V)/pu(I)", (0.02, 1.0), "virtual reactance on H", "PSID test data; ANDES REGF1 xf"
+    )
     f_B = Parameter(60.0, "Hz", (45.0, 65.0), "nominal frequency", "North American grid")
     K_Q = Parameter(0.05, "pu(V)/pu(S)", (0.0, 1.0), "reactive droop over H", "ANDES REGF1: 0.045")
     tau_E = Parameter(0.05, "s", (1e-3, 1.0), "lag of the voltage magnitude", "illustrative")
     E_min = Parameter(0.7, "pu(V)", (0.0, 1.0), "lowest internal voltage", "illustrative")
     E_max = Parameter(1.25, "pu(V)", (1.0, 2.0), "highest internal voltage", "illustrative")
-    T_0 = Parameter(5.0, "s", (0.1, 600.0), "trim of the set point, per pu(S)/pu(V)", "own choice: far slower than a fault")
+    T_0 = Parameter(
+        5.0,
+        "s",
+        (0.1, 600.0),
+        "trim of the set point, per pu(S)/pu(V)",
+        "own choice: far slower than a fault",
+    )
     K_s = Parameter(30.0, "rad/s/pu(V)", (0.0, 500.0), "gain of the resynchronisation", "illustrative")
-    eps = Parameter(1e-2, "1", (1e-6, 0.1), "width of the limit blend, over H", "own choice: numerics")
+    eps = Parameter(2e-3, "1", (1e-6, 0.1), "width of the blends, over H", "own choice: numerics")
 
     v = Input("pu(V)", "POI voltage, network frame", kind=Phasor)
     p_c = Input("pu(S)", "active-power command")

@@ -183,15 +183,17 @@ class HostingProblem:
                 return None
             if agreement is not None:
                 violated = agreement.screen.violated(solution.H, VOLTAGE_ROW_TOLERANCE)
-                known = {id(cut.origin) for cut in master.cuts}
-                master.cuts += [_tangent_cut(tangent) for tangent in violated if id(tangent) not in known]
-                self._voltage_keys.update(dict.fromkeys(tangent.key for tangent in violated))
                 if violated:
+                    master.cuts += [_tangent_cut(tangent) for tangent in violated]
+                    self._voltage_keys.update(dict.fromkeys(tangent.key for tangent in violated))
                     continue
             cut = self.certifier.certify(solution.H)
             if cut is not None:
+                fresh = self._as_cut(cut)
+                if fresh.a @ solution.H <= fresh.b:
+                    raise RuntimeError("A dispatch programme is short of power but its dual does not say so.")
                 self._flow_cuts.append(cut)
-                master.cuts.append(self._as_cut(cut))
+                master.cuts.append(fresh)
                 continue
             if agreement is None or agreement.reached(solution, master):
                 return solution

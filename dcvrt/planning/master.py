@@ -96,15 +96,15 @@ class Master:
         self.sites, self.lower, self.upper, self.rows = tuple(sites), lower, upper, tuple(rows)
         self.cuts: list[Cut] = []
         place = {bus: i for i, bus in enumerate(sites)}
-        self._a = np.zeros((len(rows), len(sites)))
+        self.coefficients = np.zeros((len(rows), len(sites)))
         for r, row in enumerate(rows):
             for bus, a in row.coefficients.items():
-                self._a[r, place[bus]] = a
-        self._c = np.array([row.lower for row in rows], dtype=float)
+                self.coefficients[r, place[bus]] = a
+        self.required = np.array([row.lower for row in rows], dtype=float)
         self._site = np.array([-1 if row.site is None else place[row.site] for row in rows], dtype=np.int64)
-        least = np.minimum(self._a * upper, 0.0)  # every site may be closed, so H_j ranges from 0
+        least = np.minimum(self.coefficients * upper, 0.0)  # every site may be closed, so H_j ranges from 0
         own = least[np.arange(len(rows)), self._site] if len(rows) else np.zeros(0)
-        self._relief = np.maximum(self._c - (least.sum(axis=1) - own), 0.0)
+        self._relief = np.maximum(self.required - (least.sum(axis=1) - own), 0.0)
         self._relief[self._site < 0] = 0.0
         self.may_close = bool((self._relief > 0).any() or (lower > 0).any())
         """Whether closing a site can help; if not, the programme is linear."""
@@ -114,30 +114,36 @@ class Master:
         if not self.may_close:
             return self.solve(np.ones(len(self.sites), dtype=bool))
         n = len(self.sites)
-        eye = np.eye(n)
         cut_a, cut_b = self._cut_arrays()
-        relief = np.zeros((len(self.rows), n))
-        on_site = self._site >= 0
-        relief[np.flatnonzero(on_site), self._site[on_site]] = -self._relief[on_site]
-        matrix = np.block([[cut_a, np.zeros((len(cut_b), n))], [self._a, relief],
-                           [eye, -np.diag(self.upper)], [eye, -np.diag(self.lower)]])
-        low = np.r_[np.full(len(cut_b), -np.inf), self._c - self._relief, np.full(n, -np.inf), np.zeros(n)]
-        high = np.r_[cut_b, np.full(len(self.rows), np.inf), np.zeros(n), np.full(n, np.inf)]
+        choice, low, high = self.with_choice()
         found = self._run(np.r_[np.ones(n), np.zeros(n)], np.zeros(2 * n), np.r_[self.upper, np.ones(n)],
-                          matrix, low, high, np.r_[np.zeros(n, bool), np.ones(n, bool)])
+                          np.vstack([np.hstack([cut_a, np.zeros((len(cut_b), n))]), choice]),
+                          np.r_[np.full(len(cut_b), -np.inf), low], np.r_[cut_b, high],
+                          np.r_[np.zeros(n, bool), np.ones(n, bool)])
         if found is None:
             return None
         values, total, _, _ = found
         nothing = np.zeros(0)
         return Solution(values[:n], values[n:] > 0.5, total, nothing, nothing, nothing)
 
+    def with_choice(self) -> tuple[Floats, Floats, Floats]:
+        """Requirement rows and size limits over [H, z]: matrix, lower and upper right-hand sides."""
+        n = len(self.sites)
+        relief = np.zeros((len(self.rows), n))
+        on_site = self._site >= 0
+        relief[np.flatnonzero(on_site), self._site[on_site]] = -self._relief[on_site]
+        matrix = np.block([[self.coefficients, relief], [np.eye(n), -np.diag(self.upper)],
+                           [np.eye(n), -np.diag(self.lower)]])
+        return (matrix, np.r_[self.required - self._relief, np.full(n, -np.inf), np.zeros(n)],
+                np.r_[np.full(len(self.rows), np.inf), np.zeros(n), np.full(n, np.inf)])
+
     def solve(self, is_open: Flags) -> Solution | None:
         """Optimum for given open sites, with prices, or None when they cannot all be open."""
         n = len(self.sites)
         cut_a, cut_b = self._cut_arrays()
         holds = np.array([s < 0 or bool(is_open[s]) for s in self._site], dtype=bool)
-        matrix = np.vstack([cut_a, self._a[holds]])
-        low = np.r_[np.full(len(cut_b), -np.inf), self._c[holds]]
+        matrix = np.vstack([cut_a, self.coefficients[holds]])
+        low = np.r_[np.full(len(cut_b), -np.inf), self.required[holds]]
         high = np.r_[cut_b, np.full(int(holds.sum()), np.inf)]
         found = self._run(np.ones(n), np.where(is_open, self.lower, 0.0), np.where(is_open, self.upper, 0.0),
                           matrix, low, high, None)

@@ -114,17 +114,18 @@ class VoltageInfo:
     passes : int
         Linearisations after the first.
     guard_pu : float
-        Hours in which the screen puts a voltage closer to a limit than this were solved by AC power flow.
+        Widest guard band of a bus: hours in which the screen puts a voltage within its bus's band of a limit were
+        solved by AC power flow.
     checked : int
-        Number of these hours.
+        Number of these hours, with the worst hour of each bus.
     v_error_pu : float
-        Largest difference between AC power flow and screen in them.
+        Largest difference between AC power flow and screen among the voltages within their guard bands.
     v_min_pu, v_max_pu : float
-        Extremes of the AC voltages at `pq` buses in them; NaN when no hour was near a limit.
+        Extremes of the AC voltages at `pq` buses in them.
     widened : int
         Bus-hours outside the limits with nothing hosted, which must only not get worse.
-    lowest, highest : arrays (hours,)
-        Extremes of the voltages of each hour over all `pq` buses as the screen has them.
+    room : array (hours,)
+        Least distance of a voltage to its limit in each hour as the screen has it, pu.
     """
 
     screen: str
@@ -135,8 +136,7 @@ class VoltageInfo:
     v_min_pu: float
     v_max_pu: float
     widened: int
-    lowest: npt.NDArray[np.float64] = field(repr=False)
-    highest: npt.NDArray[np.float64] = field(repr=False)
+    room: npt.NDArray[np.float64] = field(repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +186,8 @@ class AcVerdict:
     v_min_pu, v_max_pu : float
         Extremes over `pq` buses and hours that have a solution.
     v_error_pu : float
-        Largest difference between AC and linear screen of the extreme voltages of an hour, over hours in which
-        one of them lies within the guard band of a limit.
+        Largest difference between AC and linear screen of the least distance to a limit, over the hours in which
+        either puts it below 5e-4 pu; elsewhere no limit is near and the screen may be cruder.
     hour, bus : int or None
         Where the voltage is nearest to a limit, or farthest beyond it.
     status : str

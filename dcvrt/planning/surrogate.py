@@ -22,7 +22,7 @@ Both are tightened by the largest overprediction on the fitting set (eqs. (surro
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -342,25 +342,3 @@ def pooled_scores(fits: Sequence[Surrogate]) -> list[dict[str, float | int | str
 def false_passes(fits: Sequence[Surrogate]) -> int:
     """Validation points that a tightened surrogate passes and the simulation does not."""
     return sum(int(((f.validation[2] >= 0) & (f.validation[1] < 0)).sum()) for f in fits)
-
-
-def closed_sites(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d: Mapping[str, float],
-                 upper: npt.ArrayLike) -> dict[int, Surrogate]:
-    """Sites at which a margin is negative wherever one looks in the box: closed whatever the programme does.
-
-    Returns
-    -------
-    dict of site to Surrogate
-        The first margin that no hosting vector in [0, upper] makes non-negative.
-    """
-    closed: dict[int, Surrogate] = {}
-    box = np.asarray(upper, dtype=float)
-    for f in fits:
-        if f.site in closed:
-            continue
-        for period in (f.period,) if f.period else d:
-            coefficients, bound = f.at(beta, d[period], sites.index(f.site))
-            if float(np.maximum(coefficients, 0.0) @ box) < bound:
-                closed[f.site] = f
-                break
-    return closed

@@ -60,6 +60,7 @@ class HostedFlow:
         self.change = hosting_directions(network, sites, pf)
         self.scheduled = injections(network, year.load, year.wind)
         self._all = np.arange(len(year))
+        self._latest: npt.NDArray[np.complex128] | None = None  # the next capacities are mostly near the last ones
 
     @cached_property
     def base(self) -> npt.NDArray[np.complex128]:
@@ -69,8 +70,12 @@ class HostedFlow:
     def solve(self, H: Floats, hours: Integers | None = None) -> HourlySolution:
         """AC power flow at `H` of the hours at the given positions (default all)."""
         at = self._all if hours is None else hours
+        if self._latest is None:
+            self._latest = self.base.copy()
         demand = self.scheduled[:, at] + np.outer(self.change.T @ H, self.year.dc[at])
-        return self.flow.solve_hours(demand, start=self.base[:, at], hours=self.year.hours[at])
+        solved = self.flow.solve_hours(demand, start=self._latest[:, at], hours=self.year.hours[at])
+        self._latest[:, at] = np.where(solved.converged, solved.v, self.base[:, at])
+        return solved
 
 
 class VoltageScreen:
@@ -144,11 +149,6 @@ class VoltageScreen:
             if over[bus, hour] > tolerance:
                 found.append(self.tangent(bus, hour, side))
         return found
-
-    def near(self, H: Floats, guard: float) -> Integers:
-        """Hours in which a linear voltage is closer to a limit than `guard`."""
-        now = self.voltages(H)
-        return np.flatnonzero(np.minimum(now - self.lower, self.upper - now).min(axis=0) < guard)
 
     def relinearise(self, H: Floats, hours: Integers, v: npt.NDArray[np.complex128], steep: Integers) -> None:
         """Make the screen exact at `H` in `hours`, with new slopes in those of them at places `steep`.

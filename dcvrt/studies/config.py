@@ -43,7 +43,10 @@ class GridSection(Section):
     dynamics: str | None = Field(None, description="path of the dynamic data, where the case keeps them apart (.dyr)")
     sites: list[int] = Field(min_length=1, description="candidate buses")
     engine: Literal["andes"] = Field("andes", description="simulator of the fault waveforms")
-    t_end_s: Positive = Field(3.0, description="length of every fault simulation")
+    t_end_s: Positive = Field(2.0, description="length of every fault simulation")
+    step_s: float = Field(1 / 120, gt=0, le=0.05, description="step of the fault simulation")
+    redispatch: Literal["proportional", "slack"] = Field(
+        "proportional", description="who supplies the hosted load: all scheduled units, or the one at the slack bus")
 
 
 class HostingSection(Section):

@@ -13,7 +13,8 @@ in which the work was done):
                fault); v_margin_pu, loss_margin_share, loss_margin_mw, loss_share, loss_mw; v_poi_min_pu (lowest
                retained voltage); status (a sentence), ok (1 when the run has margins), sequence (modes passed
                through), battery (1 when the supervisor visited BATTERY), diagnostics (JSON).
-               Where ok = 0 the margins are empty and the row counts as a failure, never as a pass.
+               Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in says
+               what failed: 'grid' (no waveform), 'facility' or 'task' (set aside before it ended).
 `waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave, else those
                of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The first
                signal is always t_s.
@@ -21,11 +22,11 @@ in which the work was done):
                beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening; n_fit,
                n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is not the most
                common one), n_sequences; mae, rmse, worst_over, worst_under, violation_rate, on the validation set.
-`predictions`  validation points of every surrogate: method, mode, site, fault, target, period, beta, hosting,
-               margin, predicted.
+`predictions`  validation points of every surrogate, numbered: method, mode, site, fault, target, period, beta,
+               hosting, point, margin, predicted.
 `plans`        method ('none' is the plan without ride-through), mode, beta, hosting, total_mw, by_site, binding and
                closed (JSON), carried_from (the smaller beta it was found at, or empty), ac_passed, ac_v_min_pu,
-               ac_v_error_pu; replayed (1 once every run of it was made), passed, worst_voltage_margin_pu,
+               ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed, worst_voltage_margin_pu,
                worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss, aggregate: where}, n_failed.
 """
 
@@ -59,7 +60,7 @@ TABLES = {
     "margins": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
                "mode TEXT NOT NULL, beta REAL NOT NULL, h_mw REAL, p_mw REAL, v_margin_pu REAL, loss_margin_share REAL, "
                "loss_margin_mw REAL, loss_share REAL, loss_mw REAL, v_poi_min_pu REAL, status TEXT NOT NULL, "
-               "ok INTEGER NOT NULL, sequence TEXT NOT NULL, battery INTEGER NOT NULL, diagnostics TEXT NOT NULL, "
+               "ok INTEGER NOT NULL, failed_in TEXT NOT NULL, sequence TEXT NOT NULL, battery INTEGER NOT NULL, diagnostics TEXT NOT NULL, "
                "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "waveforms": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
                  "mode TEXT NOT NULL, beta REAL NOT NULL, signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT NULL, "
@@ -71,11 +72,11 @@ TABLES = {
                   "violation_rate REAL, PRIMARY KEY (method, mode, site, fault, target, period, beta)",
     "predictions": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
                    "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, "
-                   "margin REAL NOT NULL, predicted REAL NOT NULL, "
-                   "PRIMARY KEY (method, mode, site, fault, target, period, beta, hosting)",
+                   "point INTEGER NOT NULL, margin REAL NOT NULL, predicted REAL NOT NULL, "
+                   "PRIMARY KEY (method, mode, site, fault, target, period, beta, point)",
     "plans": "method TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
              "by_site TEXT NOT NULL, binding TEXT NOT NULL, closed TEXT NOT NULL, carried_from REAL, ac_passed INTEGER, "
-             "ac_v_min_pu REAL, ac_v_error_pu REAL, replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
+             "ac_v_min_pu REAL, ac_v_error_pu REAL, ac_status TEXT, replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
              "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
              "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
 }

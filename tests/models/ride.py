@@ -27,7 +27,9 @@ class System:
         self.automaton = dae.automata[0] if dae.automata else None
         rows = self.automaton.rows if self.automaton else ()
         self.rows = rows
-        self.guards = ca.Function("guards", args, [ca.vertcat(*[r.guard for r in rows]) if rows else ca.SX(0, 1)])
+        self.guards = ca.Function(
+            "guards", args, [ca.vertcat(*[r.guard for r in rows]) if rows else ca.SX(0, 1)]
+        )
         helds = ca.Function("held", [dae.p], [ca.vertcat(*[r.held for r in rows]) if rows else ca.SX(0, 1)])
         self.held = np.array(helds(self.p)).ravel()
 
@@ -55,7 +57,9 @@ class System:
                 return x
             x = x - np.linalg.solve(self.matrix(x, u, mode), r)
         worst = np.argsort(-np.abs(r))[:5]
-        raise ArithmeticError("no equilibrium: " + ", ".join(f"{self.dae.x_names[k]} {r[k]:.2e}" for k in worst))
+        raise ArithmeticError(
+            "no equilibrium: " + ", ".join(f"{self.dae.x_names[k]} {r[k]:.2e}" for k in worst)
+        )
 
 
 @dataclass
@@ -109,7 +113,12 @@ def ride(
             since[:] = np.nan
             modes.append((a, mode))
         done = solve_ivp(
-            lambda t, x: system.rate(x, inside(t), mode, t - entered), (a, b), x, method="LSODA", rtol=rtol, atol=1e-9
+            lambda t, x: system.rate(x, inside(t), mode, t - entered),
+            (a, b),
+            x,
+            method="LSODA",
+            rtol=rtol,
+            atol=1e-9,
         )
         assert done.success, done.message
         x = done.y[:, -1]

@@ -1,0 +1,10 @@
+"""Integration: the Simulator, and the solvers behind it."""
+
+from __future__ import annotations
+
+from dcvrt.integrators.batch import BatchResult
+from dcvrt.integrators.casadi import Casadi
+from dcvrt.integrators.compiler import NoCompilerWarning, cache_folder, find_compiler
+from dcvrt.integrators.simulator import Simulator
+
+__all__ = ["BatchResult", "Casadi", "NoCompilerWarning", "Simulator", "cache_folder", "find_compiler"]

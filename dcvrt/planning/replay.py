@@ -1,0 +1,245 @@
+"""The network-coupled ride-through check (paper: Algorithm 1, lines 3 to 7): one hosting vector in one period.
+
+The grid is rebuilt with the hosted load, every fault is simulated, and the voltage at every site drives the facility.
+Samples and replays of plans go through the same function. It takes and gives plain data, so that it can run in any
+process.
+
+A facility model is proportional to its size, so it runs on the base S_B = H (H = 1 pu); the size acts through the
+voltage waveform, and megawatts are shares times the site's import.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dcvrt.errors import InfeasibleError, SimulationError
+
+if TYPE_CHECKING:
+    from dcvrt.criteria import Criteria
+    from dcvrt.grid import Grid, Period
+    from dcvrt.integrators import Simulator
+    from dcvrt.trajectory import Trajectory
+    from dcvrt.waveform import Waveform
+
+SIGNALS = ("v_it", "p_g", "q_g", "i_g", "p_b", "soc", "w_dc", "p_out", "mode")
+"""Facility outputs that are kept of the worst cases."""
+SIGNAL_UNITS = {"v_it": "pu", "i_g": "pu", "soc": "1", "w_dc": "1", "mode": "1"}
+SAVE_AT = 2e-3
+"""Distance of the samples that are kept, s."""
+
+
+def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Simulate all faults of one hosting vector in one period, and every wanted facility on every waveform.
+
+    Parameters
+    ----------
+    request : mapping of plain data
+        `case`, `dynamics`, `sites`, `pf`, `redispatch`, `step_s`, `t_end_s`: the grid;
+        `hosting`: MW by site, in the order of `sites`;
+        `period`: {name, hour, load_scale, wind {bus: MW}, dc_factor};
+        `faults`: [{bus, t_start_s, t_clear_ms, x_pu}];
+        `runs`: [[mode, beta], ...]; `parameters`: {mode: {path: value}}; `criteria`: keywords of `Criteria`;
+        `keep`: True to give back the waveforms too: the voltages of all faults and, for each run, the facility
+        where its voltage margin and where its loss margin is least.
+
+    Returns
+    -------
+    dict
+        `rows`: one for each fault, site and run, with the columns of the store's `margins` (no hosting name);
+        `waveforms`: those kept, as keywords of `Store.put_waveform` with `signals`;
+        `grid`, `facility`: simulations made.
+        A simulation that failed gives rows with ok = 0, its status and no margins.
+    """
+    from dcvrt.grid import Period
+
+    given = dict(request["period"])
+    wind = {int(bus): mw for bus, mw in given.pop("wind").items()}
+    period = Period(wind=wind, **given)
+    sites = [int(bus) for bus in request["sites"]]
+    hosting = dict(zip(sites, map(float, request["hosting"]), strict=True))
+    runs, keep = [(mode, float(beta)) for mode, beta in request["runs"]], bool(request.get("keep", False))
+    answer: dict[str, Any] = {"rows": [], "waveforms": [], "grid": 0, "facility": 0}
+    for label, waveforms, status in _fault_runs(request, hosting, period):
+        answer["grid"] += 1
+        if waveforms is None:
+            answer["rows"] += lost_rows(request, status, "grid", faults=[label])
+            continue
+        rows = []
+        for mode in dict.fromkeys(mode for mode, _ in runs):
+            betas = [beta for m, beta in runs if m == mode]
+            rows += _facility_rows(request, mode, betas, waveforms, hosting, period.dc_factor)
+        for row in rows:
+            answer["rows"].append({"period": period.name, "fault": label, **row})
+        answer["facility"] += len(rows)
+        if keep:
+            answer["waveforms"] += [
+                {"period": period.name, "fault": label, "site": site,
+                 "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)}}
+                for site, w in waveforms.items()]
+            answer.setdefault("_waveforms", {})[label] = waveforms
+    if keep:
+        kept = answer.pop("_waveforms", {})
+        for mode, beta in runs:
+            for fault, site in _worst(answer["rows"], hosting, mode, beta):
+                run = _simulator(mode, _frozen(request["parameters"].get(mode, {})), SAVE_AT)(
+                    kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"]))
+                answer["waveforms"].append({"period": period.name, "fault": fault, "site": site, "mode": mode,
+                                            "beta": beta, "signals": _signals(run)})
+    return answer
+
+
+def lost_rows(request: Mapping[str, Any], status: str, failed_in: str,
+              faults: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Rows that stand for runs that were not made: not ok, no margins, and the reason.
+
+    `failed_in` is 'grid' when there was no waveform, 'task' when the whole task was set aside.
+    """
+    if faults is None:
+        faults = [fault_label(f) for f in request["faults"]]
+    return [_row(request["period"]["name"], fault, int(site), mode, float(beta), float(H), status, failed_in)
+            for fault in faults for site, H in zip(request["sites"], request["hosting"], strict=True)
+            for mode, beta in request["runs"]]
+
+
+def fault_label(fault: Mapping[str, Any]) -> str:
+    """What tables call a fault of a request."""
+    return f"bus {fault['bus']}, {fault['t_clear_ms']:g} ms"
+
+
+# -- the two halves -----------------------------------------------------------------------------------------------
+
+
+def _fault_runs(request: Mapping[str, Any], hosting: Mapping[int, float],
+                period: Period) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
+    """Label, waveforms by site (None when there are none) and status of every fault."""
+    from dcvrt.grid import BusFault
+
+    labels = {BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): fault_label(f)
+              for f in request["faults"]}
+    grid = _grid(request["case"], request["dynamics"], tuple(hosting), float(request["pf"]), request["redispatch"])
+    try:
+        found = grid.waveforms_of(hosting, period, list(labels), until=float(request["t_end_s"]),
+                                  step=float(request["step_s"]))
+    except (SimulationError, InfeasibleError) as error:  # the operating point itself has no solution
+        return [(label, None, str(error)) for label in labels.values()]
+    return [(label, found[fault].waveforms if found[fault].completed else None, found[fault].status)
+            for fault, label in labels.items()]
+
+
+def _facility_rows(request: Mapping[str, Any], mode: str, betas: Sequence[float], waveforms: Mapping[int, Waveform],
+                   hosting: Mapping[int, float], d: float) -> list[dict[str, Any]]:
+    """One mode at several ratings on the waveforms of one fault."""
+    simulator = _simulator(mode, _frozen(request["parameters"].get(mode, {})), None)
+    cases = [(site, beta) for site in waveforms for beta in betas]
+    result = simulator.batch([waveforms[site] for site, _ in cases],
+                             {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for _, beta in cases]},
+                             criteria=_criteria(_frozen(request["criteria"])))
+    raise NotImplementedError
+
+
+# -- what a process keeps -----------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4)
+def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, redispatch: str) -> Grid:
+    from dcvrt.grid import Grid
+
+    return Grid.from_case(case if case == "ieee118" else Path(case), sites=sites, pf=pf, dynamics=dynamics,
+                          redispatch=redispatch)
+
+
+@lru_cache(maxsize=16)
+def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...], save_at: float | None) -> Simulator:
+    from dcvrt import facility
+    from dcvrt.integrators import Simulator
+
+    diagram = facility.get(mode)
+    for path, value in parameters:
+        diagram.set(path, value)
+    return Simulator(diagram.compile(), save_at=save_at)
+
+
+@lru_cache(maxsize=4)
+def _criteria(values: tuple[tuple[str, Any], ...]) -> Criteria:
+    from dcvrt.criteria import Criteria
+
+    return Criteria(**dict(values))
+
+
+def _frozen(values: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(values.items()))
+
+
+# -- rows ---------------------------------------------------------------------------------------------------------
+
+
+def _row(period: str, fault: str, site: int, mode: str, beta: float, H: float, status: str,
+         failed_in: str) -> dict[str, Any]:
+    nan = math.nan
+    return {"period": period, "fault": fault, "site": site, "mode": mode, "beta": beta, "h_mw": H, "p_mw": nan,
+            "v_margin_pu": nan, "loss_margin_share": nan, "loss_margin_mw": nan, "loss_share": nan, "loss_mw": nan,
+            "v_poi_min_pu": nan, "status": status, "ok": 0, "failed_in": failed_in, "sequence": "", "battery": 0,
+            "diagnostics": {}}
+
+
+def _worst(rows: Sequence[Mapping[str, Any]], hosting: Mapping[int, float], mode: str, beta: float) -> list[tuple[str, int]]:
+    """Fault and site with the least voltage margin, and with the least loss margin, at sites that host something."""
+    good = [r for r in rows if r["ok"] and (r["mode"], r["beta"]) == (mode, beta) and hosting[r["site"]] > 0]
+    if not good:
+        return []
+    worst = [min(good, key=lambda r: r[target]) for target in ("v_margin_pu", "loss_margin_mw")]
+    return list(dict.fromkeys((r["fault"], r["site"]) for r in worst))
+
+
+def _signals(run: Trajectory) -> dict[str, Any]:
+    kept = {"t_s": run.t}
+    for name in SIGNALS:
+        kept[f"{name}_{SIGNAL_UNITS.get(name, 'pu')}"] = run[name]
+    return kept
+
+
+# -- verdicts -----------------------------------------------------------------------------------------------------
+
+
+def verdict(rows: Sequence[Mapping[str, Any]], by_site: Mapping[int, float], expected: int) -> dict[str, Any]:
+    """Whether a plan rides through: the worst margins over all faults, periods and open sites.
+
+    Parameters
+    ----------
+    rows : checked runs of the plan at its mode and rating, all sites.
+    by_site : capacities; a site with 0 MW has no facility that could fail.
+    expected : number of runs that the check consists of (faults x periods x open sites).
+
+    Returns
+    -------
+    dict
+        `passed`; `worst_voltage_margin_pu`, `worst_loss_margin_mw` (None when nothing is hosted or nothing ran);
+        `aggregate_loss_mw`: largest sum of the sites' losses in one fault and period; `worst`: where each of these
+        occurs; `n_failed`: runs that failed or are missing. With any of these the plan has not passed.
+    """
+    here = [r for r in rows if by_site[r["site"]] > 0]
+    good = [r for r in here if r["ok"]]
+    n_failed = expected - len(good)
+    answer: dict[str, Any] = {"passed": n_failed == 0, "worst_voltage_margin_pu": None, "worst_loss_margin_mw": None,
+                              "aggregate_loss_mw": 0.0 if expected == 0 else None, "worst": {}, "n_failed": n_failed}
+    if not good:
+        return answer
+    voltage = min(good, key=lambda r: r["v_margin_pu"])
+    loss = min(good, key=lambda r: r["loss_margin_mw"])
+    aggregate: dict[tuple[str, str], float] = {}
+    for r in good:
+        aggregate[r["period"], r["fault"]] = aggregate.get((r["period"], r["fault"]), 0.0) + r["loss_mw"]
+    at = max(aggregate, key=lambda key: aggregate[key])
+    where = ("site", "fault", "period", "sequence")
+    return answer | {
+        "passed": bool(n_failed == 0 and voltage["v_margin_pu"] >= 0.0 and loss["loss_margin_mw"] >= 0.0),
+        "worst_voltage_margin_pu": voltage["v_margin_pu"], "worst_loss_margin_mw": loss["loss_margin_mw"],
+        "aggregate_loss_mw": aggregate[at],
+        "worst": {"voltage": {key: voltage[key] for key in where}, "loss": {key: loss[key] for key in where},
+                  "aggregate": {"period": at[0], "fault": at[1]}}}
