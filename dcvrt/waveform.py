@@ -231,7 +231,8 @@ class Waveform:
         Parameters
         ----------
         retained : voltage magnitude in the sag, pu.
-        start, length, until : begin and duration of the sag and end of the waveform, s.
+        start, length, until : begin and duration of the sag and end of the waveform, s; a sag that lasts longer
+            than the waveform ends with it.
         phase_jump : angle of the phasor during the sag, rad.
         """
         if retained < 0.0 or length <= 0.0:
@@ -239,7 +240,9 @@ class Waveform:
                 f"sag: retained = {retained:g} pu must not be negative, length = {length:g} s not zero."
             )
         during = retained * cmath.exp(1j * phase_jump)
-        steps: list[Segment] = [(0.0, 1.0), (start, during), (start + length, 1.0)]
+        steps: list[Segment] = [(0.0, 1.0), (start, during)]
+        if start + length < until:
+            steps.append((start + length, 1.0))
         return cls.segments(steps, until, name=f"sag to {retained:g} pu for {length * 1e3:g} ms")
 
     @classmethod

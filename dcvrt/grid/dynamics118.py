@@ -67,7 +67,9 @@ def table() -> dict[str, dict[str, dict[str, Figure]]]:
     """
     source = importlib.resources.files("dcvrt") / "data" / "ieee118" / "machine_classes.csv"
     classes: dict[str, dict[str, dict[str, Figure]]] = {}
-    for row in csv.DictReader(line for line in source.read_text(encoding="utf-8").splitlines() if line[0] != "#"):
+    for row in csv.DictReader(
+        line for line in source.read_text(encoding="utf-8").splitlines() if line[0] != "#"
+    ):
         figure = Figure(float(row["value"]), row["unit"], row["source"], row["note"])
         classes.setdefault(row["class"], {}).setdefault(row["model"], {})[row["symbol"]] = figure
     return classes
@@ -87,8 +89,13 @@ def machines(network: Network) -> list[Machine]:
     >>> sorted((kind, sum(m.kind == kind for m in units)) for kind in {m.kind for m in units})
     [('condenser', 35), ('large', 7), ('medium', 12)]
     """
-    classes = {kind: {model: MappingProxyType({symbol: figure.value for symbol, figure in symbols.items()})
-                      for model, symbols in models.items()} for kind, models in table().items()}
+    classes = {
+        kind: {
+            model: MappingProxyType({symbol: figure.value for symbol, figure in symbols.items()})
+            for model, symbols in models.items()
+        }
+        for kind, models in table().items()
+    }
     units, found = network.generators, []
     for k, bus in enumerate(units.bus.tolist()):
         if units.p_set[k] > 0:
@@ -98,6 +105,8 @@ def machines(network: Network) -> list[Machine]:
             s_n = float(np.clip(CONDENSER_OVER_Q_MAX * units.q_max[k], *CONDENSER_MVA))
             kind = "condenser"
         if not np.isfinite(s_n) or s_n <= 0:
-            raise InputError(f"unit {units.name[k]}: rating of {s_n:g} MVA from its limits. Way out: give p_max and q_max.")
+            raise InputError(
+                f"unit {units.name[k]}: rating of {s_n:g} MVA from its limits. Way out: give p_max and q_max."
+            )
         found.append(Machine(k, bus, kind, s_n, MappingProxyType(classes[kind])))
     return found

@@ -47,7 +47,10 @@ def read(path: Path) -> Case:
         problems.append("has no positive mpc.baseMVA.")
     version = re.search(r"mpc\.version\s*=\s*'(\w+)'", text)
     if version is None or version.group(1) != "2":
-        problems.append("is not a version 2 case (mpc.version = '2'). Way out: convert it with MATPOWER's loadcase/savecase.")
+        problems.append(
+            "is not a version 2 case (mpc.version = '2'). "
+            "Way out: convert it with MATPOWER's loadcase and savecase."
+        )
     tables = {name: _table(text, name, problems) for name in COLUMNS}
     raise_all(problems, str(path))
     assert base is not None
@@ -73,7 +76,9 @@ def _table(text: str, name: str, problems: list[str]) -> npt.NDArray[np.float64]
                 return nothing
             if len(row) < COLUMNS[name] or (rows and len(row) != len(rows[0])):
                 want = len(rows[0]) if rows else COLUMNS[name]
-                problems.append(f"{where} has {len(row)} columns, expected {'' if rows else 'at least '}{want}.")
+                problems.append(
+                    f"{where} has {len(row)} columns, expected {'' if rows else 'at least '}{want}."
+                )
                 return nothing
             rows.append(row)
     if not rows:

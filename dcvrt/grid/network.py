@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import importlib.resources
-import importlib.util
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,6 @@ import scipy.sparse.linalg as spla
 from scipy.sparse.csgraph import connected_components
 
 from dcvrt.errors import InputError, did_you_mean, raise_all
-from dcvrt.grid import matpower
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -228,7 +224,7 @@ class Network:
         return sp.csr_matrix((values, at), shape=(m, len(self.bus)))
 
     def ptdf(self) -> Floats:
-        """Power transfer distribution factors: DC branch flow per MW injected at a bus and taken at the slack.
+        """Power transfer distribution factors: DC branch flow per MW injected at a bus, taken at the slack.
 
         Returns
         -------
@@ -274,8 +270,9 @@ class Network:
         InputError
             When the file is missing or a table of it cannot be read, with the table and the line.
         """
-        path = Path(path)
-        return _from_tables(matpower.read(path), path.stem)
+        from dcvrt.grid import cases
+
+        return cases.from_matpower(Path(path))
 
     @classmethod
     def ieee118(cls) -> Network:
@@ -291,25 +288,13 @@ class Network:
         >>> network.branches.label(0), float(network.branches.rating[0])
         ('1-2', 151.0)
         """
-        spec = importlib.util.find_spec("andes")  # located, not imported: importing it takes a second
-        if spec is None or spec.origin is None:
-            raise InputError("ieee118: the case file comes with the package 'andes', which is not installed. "
-                             "Way out: pip install andes, or Network.from_matpower(path) with your own case118.m.")
-        bare = cls.from_matpower(Path(spec.origin).parent / "cases" / "matpower" / "case118.m")
-        lines, units = bare.branches, bare.generators
-        table = importlib.resources.files("dcvrt") / "data" / "pglib" / "ieee118_ratings.csv"
-        rows = list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
-        ends = [(int(row["from_bus"]), int(row["to_bus"])) for row in rows]
-        if ends != list(zip(lines.from_bus.tolist(), lines.to_bus.tolist(), strict=True)):
-            raise InputError("ieee118: case118.m of the installed andes package lists its branches in another order "
-                             "than the ratings table. Way out: install an andes version that dcvrt supports.")
-        return replace(bare, name="ieee118",
-                       branches=replace(lines, rating=np.array([float(row["rating_mva"]) for row in rows])),
-                       generators=replace(units, p_min=np.zeros(len(units))))
+        from dcvrt.grid import cases
+
+        return cases.ieee118()
 
 
 def _freeze(record: Any) -> None:
-    """Give a frozen dataclass read-only copies of its arrays, so that what is derived from them stays true."""
+    """Give a frozen dataclass read-only copies of its arrays: what is derived from them stays true."""
     for field in fields(record):
         value = getattr(record, field.name)
         if isinstance(value, np.ndarray):
@@ -334,66 +319,36 @@ def _faults(network: Network) -> list[str]:
         for field in fields(table):
             value = getattr(table, field.name)
             if isinstance(value, np.ndarray) and value.dtype.kind == "f" and np.isnan(value).any():
-                problems.append(f"{what} column {field.name!r} has NaN in row {int(np.flatnonzero(np.isnan(value))[0])}.")
+                problems.append(
+                    f"{what} column {field.name!r} has NaN in row {int(np.flatnonzero(np.isnan(value))[0])}."
+                )
     for k in range(len(lines)):
         strange = [int(b) for b in (lines.from_bus[k], lines.to_bus[k]) if int(b) not in known]
-        problems += [f"branch {lines.label(k)} ends at bus {b}, which is not in the bus table." for b in strange]
+        problems += [
+            f"branch {lines.label(k)} ends at bus {b}, which is not in the bus table." for b in strange
+        ]
         if lines.x[k] == 0:
-            problems.append(f"branch {lines.label(k)} has zero reactance. Way out: merge its buses or give it 1e-4 pu.")
+            problems.append(
+                f"branch {lines.label(k)} has zero reactance. Way out: merge its buses or give it 1e-4 pu."
+            )
         if lines.rating[k] < 0:
             problems.append(f"branch {lines.label(k)} has the negative rating {lines.rating[k]:g} MVA.")
     for name, bus in zip(units.name, units.bus, strict=True):
         if int(bus) not in known:
             problems.append(f"generator {name} is at bus {bus}, which is not in the bus table.")
-    for k in np.flatnonzero(units.p_min > units.p_max):
-        problems.append(f"generator {units.name[k]} has p_min {units.p_min[k]:g} MW above p_max {units.p_max[k]:g} MW.")
+    for k in np.flatnonzero(units.p_min > units.p_max).tolist():
+        problems.append(
+            f"generator {units.name[k]} has p_min {units.p_min[k]:g} MW above p_max {units.p_max[k]:g} MW."
+        )
     if not problems:
-        count, island = connected_components(abs(network.incidence.T) @ abs(network.incidence), directed=False)
-        if count > 1:
+        groups, island = connected_components(
+            abs(network.incidence.T) @ abs(network.incidence), directed=False
+        )
+        if groups > 1:
             cut_off = network.bus[island != island[network.slack]]
             shown = ", ".join(map(str, cut_off[:8])) + (", ..." if len(cut_off) > 8 else "")
-            problems.append(f"{len(cut_off)} bus(es) have no path to the slack bus: {shown}. "
-                            "Way out: close a branch to them or leave them out.")
+            problems.append(
+                f"{len(cut_off)} bus(es) have no path to the slack bus: {shown}. "
+                "Way out: close a branch to them or leave them out."
+            )
     return problems
-
-
-def _from_tables(case: matpower.Case, name: str) -> Network:
-    """Build a network from the tables of a case file."""
-    bus = case.bus[case.bus[:, matpower.BUS_TYPE] != matpower.ISOLATED]
-    number = bus[:, matpower.BUS_NUMBER].astype(np.int64)
-    live = set(number.tolist())
-    branch = case.branch[case.branch[:, matpower.BRANCH_STATUS] > 0]
-    unit = case.gen[case.gen[:, matpower.GEN_STATUS] > 0]
-    isolated = set(case.bus[:, matpower.BUS_NUMBER].astype(np.int64).tolist()) - live
-    branch = branch[[not ({int(row[0]), int(row[1])} & isolated) for row in branch]]
-    unit = unit[[int(row[0]) not in isolated for row in unit]]
-    unit_bus = unit[:, matpower.GEN_BUS].astype(np.int64)
-
-    v_set = np.ones(len(number))
-    place = {int(b): k for k, b in enumerate(number)}
-    for b, volts in zip(unit_bus, unit[:, matpower.GEN_VOLTAGE], strict=True):
-        if int(b) in place:
-            v_set[place[int(b)]] = volts
-    held = set(unit_bus.tolist())  # a bus of type 2 without a unit in service holds nothing
-    kinds = tuple("slack" if code == matpower.SLACK else "pv" if code == matpower.PV and int(b) in held else "pq"
-                  for b, code in zip(number, bus[:, matpower.BUS_TYPE], strict=True))
-    seen: dict[int, int] = {}
-    names = []
-    for b in unit_bus.tolist():
-        seen[b] = seen.get(b, 0) + 1
-        names.append(f"G{b}" if seen[b] == 1 else f"G{b}_{seen[b]}")
-    tap = branch[:, matpower.BRANCH_TAP]
-    rating = branch[:, matpower.BRANCH_RATING]
-    return Network(
-        name=name, base_mva=case.base_mva, bus=number, kind=kinds, base_kv=bus[:, matpower.BUS_BASE_KV].copy(),
-        p_load=bus[:, matpower.BUS_P].copy(), q_load=bus[:, matpower.BUS_Q].copy(),
-        g_shunt=bus[:, matpower.BUS_G].copy(), b_shunt=bus[:, matpower.BUS_B].copy(), v_set=v_set,
-        branches=Branches(
-            from_bus=branch[:, 0].astype(np.int64), to_bus=branch[:, 1].astype(np.int64),
-            r=branch[:, matpower.BRANCH_R].copy(), x=branch[:, matpower.BRANCH_X].copy(),
-            b=branch[:, matpower.BRANCH_B].copy(), tap=np.where(tap == 0, 1.0, tap),
-            shift=np.deg2rad(branch[:, matpower.BRANCH_SHIFT]), rating=np.where(rating == 0, np.inf, rating)),
-        generators=Generators(
-            bus=unit_bus, p_set=unit[:, matpower.GEN_P].copy(), p_min=unit[:, matpower.GEN_P_MIN].copy(),
-            p_max=unit[:, matpower.GEN_P_MAX].copy(), q_min=unit[:, matpower.GEN_Q_MIN].copy(),
-            q_max=unit[:, matpower.GEN_Q_MAX].copy(), name=tuple(names)))

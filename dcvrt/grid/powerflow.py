@@ -34,8 +34,10 @@ def participation(network: Network) -> Floats:
     """
     scheduled = np.maximum(network.generators.p_set, 0.0)
     if scheduled.sum() <= 0:
-        raise InputError(f"{network.name}: no generator is scheduled to generate, so none can follow the load. "
-                         "Way out: give p_set of at least one unit.")
+        raise InputError(
+            f"{network.name}: no generator is scheduled to generate, so none can follow the load. "
+            "Way out: give p_set of at least one unit."
+        )
     return scheduled / scheduled.sum()
 
 
@@ -56,8 +58,9 @@ def dispatch(network: Network, net_load: Floats | float) -> Floats:
     return np.multiply.outer(participation(network), net_load)
 
 
-def injections(network: Network, load: Floats, wind: Mapping[int, Floats],
-               hosted: Mapping[int, Phasors] | None = None) -> Phasors:
+def injections(
+    network: Network, load: Floats, wind: Mapping[int, Floats], hosted: Mapping[int, Phasors] | None = None
+) -> Phasors:
     """Scheduled bus injections in MVA, generation positive, of many operating hours.
 
     Parameters
@@ -133,9 +136,11 @@ class HourlySolution:
         if not len(failed):
             return f"Solved in all {len(self.hours)} hours."
         k = failed[0]
-        return (f"Power flow has no solution in {len(failed)} of {len(self.hours)} hours; the first is hour "
-                f"{self.hours[k]}: mismatch {self.mismatch_mva[k]:.3g} MVA, largest at bus {self.worst_bus[k]}. "
-                "Way out: host less there, or check the load and the voltage set points of that hour.")
+        return (
+            f"Power flow has no solution in {len(failed)} of {len(self.hours)} hours; the first is hour "
+            f"{self.hours[k]}: mismatch {self.mismatch_mva[k]:.3g} MVA, largest at bus {self.worst_bus[k]}. "
+            "Way out: host less there, or check the load and the voltage set points of that hour."
+        )
 
     def require(self) -> HourlySolution:
         """Return itself, or raise `SimulationError` with `status` when an hour has no solution."""
@@ -187,9 +192,11 @@ class PowerFlow:
         v, iterations, worst = found
         if not abs(worst).max() < TOLERANCE:
             bus = self.network.bus[self._bus_of_row(abs(worst).argmax())]
-            raise SimulationError(f"{self.network.name}: power flow did not settle in {iterations} steps; mismatch "
-                                  f"{abs(worst).max() * self.network.base_mva:.3g} MVA, largest at bus {bus}. "
-                                  "Way out: host less there, or check loads and voltage set points.")
+            raise SimulationError(
+                f"{self.network.name}: power flow did not settle in {iterations} steps; mismatch "
+                f"{abs(worst).max() * self.network.base_mva:.3g} MVA, largest at bus {bus}. "
+                "Way out: host less there, or check loads and voltage set points."
+            )
         return OperatingPoint(v, iterations, float(abs(worst).max() * self.network.base_mva))
 
     def _bus_of_row(self, row: npt.ArrayLike) -> Integers:
@@ -206,8 +213,9 @@ class PowerFlow:
         by_angle = (1j * sp.diags(v) @ (sp.diags(current) - self._y @ sp.diags(v)).conj()).tocsr()
         by_size = (sp.diags(v) @ (self._y @ unit).conj() + sp.diags(current.conj()) @ unit).tocsr()
         a, q = self.free, self.pq
-        return sp.bmat([[by_angle[a][:, a].real, by_size[a][:, q].real],
-                        [by_angle[q][:, a].imag, by_size[q][:, q].imag]]).tocsc()
+        return sp.bmat(
+            [[by_angle[a][:, a].real, by_size[a][:, q].real], [by_angle[q][:, a].imag, by_size[q][:, q].imag]]
+        ).tocsc()
 
     def _newton(self, s: Phasors, start: Phasors, steps: int) -> tuple[Phasors, int, Floats]:
         angle, size = np.angle(start), abs(start)
@@ -228,8 +236,9 @@ class PowerFlow:
 
     # -- many hours ----------------------------------------------------------------------------------------
 
-    def solve_hours(self, injection: Phasors, start: Phasors | None = None, hours: Integers | None = None,
-                    steps: int = 40) -> HourlySolution:
+    def solve_hours(
+        self, injection: Phasors, start: Phasors | None = None, hours: Integers | None = None, steps: int = 40
+    ) -> HourlySolution:
         """Solve many operating points at once.
 
         Parameters
@@ -252,7 +261,9 @@ class PowerFlow:
         warm = None
         for group in self._groups(s):
             if start is None:
-                centre, _, left = self._newton(s[:, group].mean(axis=1), self.flat if warm is None else warm, 30)
+                centre, _, left = self._newton(
+                    s[:, group].mean(axis=1), self.flat if warm is None else warm, 30
+                )
                 if not abs(left).max() < TOLERANCE:
                     centre = self.flat  # the hours are tried one by one below
                 warm = centre
@@ -260,14 +271,17 @@ class PowerFlow:
             else:
                 begin = start[:, group]
                 centre = begin.mean(axis=1)
-            v[:, group], rest[group], row[group] = self._chord(s[:, group], begin, self._inverse(centre), steps)
+            v[:, group], rest[group], row[group] = self._chord(
+                s[:, group], begin, self._inverse(centre), steps
+            )
         for k in np.flatnonzero(~(rest < TOLERANCE)):
             v[:, k], _, left = self._newton(s[:, k], self.flat, 30)
             row[k] = abs(left).argmax()
             rest[k] = abs(left).max()
         names = np.arange(s.shape[1]) if hours is None else hours
-        return HourlySolution(v, rest < TOLERANCE, rest * self.network.base_mva,
-                              self.network.bus[self._bus_of_row(row)], names)
+        return HourlySolution(
+            v, rest < TOLERANCE, rest * self.network.base_mva, self.network.bus[self._bus_of_row(row)], names
+        )
 
     def _groups(self, s: Phasors) -> list[Integers]:
         """Hours sorted by load at `pq` buses and cut into groups of similar size."""
@@ -278,7 +292,9 @@ class PowerFlow:
         """Inverse Jacobian at one point, in single precision: it only steers, the residuals are exact."""
         return np.linalg.inv(self._jacobian(v).toarray()).astype(np.float32)
 
-    def _chord(self, s: Phasors, start: Phasors, inverse: npt.NDArray[np.float32], steps: int) -> tuple[Phasors, Floats, Integers]:
+    def _chord(
+        self, s: Phasors, start: Phasors, inverse: npt.NDArray[np.float32], steps: int
+    ) -> tuple[Phasors, Floats, Integers]:
         """Newton with one inverse for all columns; columns that are done leave the loop."""
         n, count = len(self.free), s.shape[1]
         v = start.copy()
@@ -305,8 +321,8 @@ class PowerFlow:
     def sensitivities(self, v: Phasors, directions: Phasors, scale: Floats) -> Floats:
         r"""Derivative of the voltage magnitude at every `pq` bus by each hosted MW, exactly at `v`.
 
-        Solves :math:`J_t\, x = d_t\, r_j` in every hour t for every direction r_j, by chord iteration with exact
-        residuals, to a relative residual of 1e-10.
+        Solves :math:`J_t\, x = d_t\, r_j` in every hour t for every direction r_j, by chord iteration with
+        exact residuals, to a relative residual of 1e-10.
 
         Parameters
         ----------
@@ -341,10 +357,14 @@ class PowerFlow:
                     rest = np.concatenate([power[self.free].real, power[self.pq].imag]) - right
                     if abs(rest).max() <= 1e-10 * size:
                         break
-                    x -= size * (inverse @ (rest / size).astype(np.float32))  # scaled: single precision underflows
+                    x -= size * (
+                        inverse @ (rest / size).astype(np.float32)
+                    )  # scaled: single precision underflows
                 else:
-                    raise SimulationError(f"{self.network.name}: voltage sensitivities did not settle; the operating "
-                                          "points lie close to the limit of power transfer. Way out: host less.")
+                    raise SimulationError(
+                        f"{self.network.name}: voltage sensitivities did not settle; the operating "
+                        "points lie close to the limit of power transfer. Way out: host less."
+                    )
                 result[:, group, j] = x[n:]
         return result
 
@@ -352,13 +372,16 @@ class PowerFlow:
 def hosting_directions(network: Network, sites: Integers, pf: float) -> Phasors:
     r"""Change of all scheduled injections per MW hosted at each site, MVA.
 
-    The site takes :math:`1 + j\tan\arccos \mathrm{pf}`, and the units share the active part (`participation`).
+    The site takes :math:`1 + j\tan\arccos \mathrm{pf}`, and the units share the active part
+    (`participation`).
 
     Returns
     -------
     complex array (sites, buses)
     """
     change = np.zeros((len(sites), len(network.bus)), dtype=complex)
-    np.add.at(change.T, network.generator_index, np.repeat(participation(network)[:, None], len(sites), axis=1))
+    np.add.at(
+        change.T, network.generator_index, np.repeat(participation(network)[:, None], len(sites), axis=1)
+    )
     change[np.arange(len(sites)), network.indices(sites)] -= 1.0 + 1j * np.tan(np.arccos(pf))
     return change

@@ -25,7 +25,7 @@ def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
     .. math:: p_k = \min(p_k^{max}, \kappa\, p_k^{set}), \qquad \sum_k p_k = p_{total}
 
     A unit that reaches its limit stays there and the others take over its part. Units that are scheduled to
-    generate nothing (condensers) stay at 0, and no unit goes below 0.
+    generate nothing (condensers) or to take power in stay as they are, and no other unit goes below 0.
 
     Parameters
     ----------
@@ -44,13 +44,20 @@ def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
     >>> share(np.array([300.0, 100.0, 0.0]), np.array([330.0, 200.0, 50.0]), 480.0).tolist()
     [330.0, 150.0, 0.0]
     """
-    weight = np.where(p_set > 0, p_set, 0.0)
-    ceiling = np.where(p_set > 0, p_max, 0.0)
+    follows = p_set > 0
+    weight, ceiling = np.where(follows, p_set, 0.0), np.where(follows, p_max, 0.0)
+    fixed = np.where(follows, 0.0, p_set)
+    total = total - fixed.sum()
     if not 0 <= total <= ceiling.sum():
-        way_out = ("more wind than load and losses: lower the wind or raise load_scale." if total < 0 else
-                   "host less, lower load_scale or raise p_max of some unit.")
-        raise InfeasibleError(f"redispatch: the {int((p_set > 0).sum())} units that follow the load can generate 0 to "
-                              f"{ceiling.sum():g} together, {total:g} is needed. Way out: {way_out}")
+        way_out = (
+            "more wind than load and losses: lower the wind or raise load_scale."
+            if total < 0
+            else "host less, lower load_scale or raise p_max of some unit."
+        )
+        raise InfeasibleError(
+            f"redispatch: the {int(follows.sum())} units that follow the load can generate 0 to "
+            f"{ceiling.sum():g} together, {total:g} is needed. Way out: {way_out}"
+        )
     p, at_limit = np.zeros_like(weight), np.zeros(len(weight), dtype=bool)
     while True:
         left, free = total - ceiling[at_limit].sum(), weight * ~at_limit
@@ -58,5 +65,5 @@ def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
         p = np.where(at_limit, ceiling, kappa * weight)
         over = (p > ceiling) & ~at_limit
         if not over.any():
-            return p
+            return p + fixed
         at_limit |= over

@@ -6,11 +6,12 @@ r"""Implicit trapezoidal rule on the equations of a loaded ANDES system.
 
 ANDES evaluates `f`, `g`, their Jacobian and its limiters; only the stepping is ours, for two reasons.
 
-* Exact events. ANDES steps 0.1 ms across an event and averages `f` over the jump. Here an event is its own algebraic
-  solution: `x` stays, `g = 0` gives the voltages on the other side, and the next step starts from the `f` of that
-  side. Against ANDES's own loop at 1/480 s the voltages differ by about 1e-4 pu.
-* Cost. ANDES leaves the rows of states at a limit in the Jacobian and refreshes that by the clock, which takes 4 to 10
-  iterations a step. Here a state at its limit has a unit row, and the factors are kept while they contract well.
+* Exact events. ANDES steps 0.1 ms across an event and averages `f` over the jump. Here an event is its own
+  algebraic solution: `x` stays, `g = 0` gives the voltages on the other side, and the next step starts from
+  the `f` of that side. Against ANDES's own loop at 1/480 s the voltages differ by about 1e-4 pu.
+* Cost. ANDES leaves the rows of states at a limit in the Jacobian and refreshes that by the clock, which
+  takes 4 to 10 iterations a step. Here a state at its limit has a unit row, and the factors are kept while
+  they contract well.
 
 Every step is as long as asked, so that all simulations of a study share one time layout. A step that does not
 converge is cut into halves within its interval.
@@ -27,15 +28,17 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 TOLERANCE = 1e-6
-"""Largest last correction of any state or algebraic variable, pu or rad; the error left is smaller by `SLOW`."""
+"""Largest last correction of any variable, pu or rad; the error that is left is smaller by `SLOW`."""
 ITERATIONS = 12
 EVENT_ITERATIONS = 60
 SLOW = 0.2
 """A correction that shrinks by less than this factor refreshes the Jacobian."""
 HALVINGS = 6
+UNUSED = 1e-8
+"""Diagonal entry of a state without time constant: keeps one that its device does not use where it is."""
 
 
-class NoConvergence(Exception):
+class NoConvergenceError(Exception):
     """Newton did not converge; `variable` moved most, `t` is where."""
 
     def __init__(self, t: float, variable: str) -> None:
@@ -62,7 +65,10 @@ class Stepper:
     def __init__(self, system: Any) -> None:
         from kvxopt import klu, matrix, sparse, spdiag
 
-        self._klu, self._matrix, self._sparse, self._spdiag = klu, matrix, sparse, spdiag
+        self._klu: Any = klu
+        self._matrix: Any = matrix
+        self._sparse: Any = sparse
+        self._spdiag: Any = spdiag
         self.system, self.dae, self.tds = system, system.dae, system.TDS
         self.models = system.exist.pflow_tds
         self.t = float(self.dae.t)
@@ -72,6 +78,7 @@ class Stepper:
         self.iterations = self.factorisations = 0
         self._symbolic: Any = None
         self._factors: Any = None
+        self._still: Integers = np.empty(0, dtype=np.int64)
         self._factored: tuple[float, tuple[int, ...]] = (-1.0, ())
         self.evaluate(0)
 
@@ -90,23 +97,30 @@ class Stepper:
     def _factorise(self, h: float, pegged: Integers) -> None:
         dae, spdiag = self.dae, self._spdiag
         self.system.j_update(models=self.models)
-        # Row scales: a state at its limit has only its unit entry, a state without time constant only its f.
+        # Rows: a state at its limit has only its unit entry, a state without time constant only its f.
         scale = np.where(self.instant, 1.0, 0.5 * h)
-        scale[pegged] = 0.0
-        unit = np.where(self.instant, 0.0, self.T)
-        unit[pegged] = 1.0
+        unit = np.where(self.instant, UNUSED, self.T)
+        self._still = pegged
+        if h == 0:
+            # A state without time constant that is not in its own equation (of a filter switched off by zeros)
+            # follows from the states that it drives, and these stay in an event: it waits for the next step.
+            own = np.ravel(self._matrix(dae.fx[:: self.n + 1]))
+            self._still = np.union1d(pegged, np.flatnonzero(self.instant & (own == 0)))
+        scale[self._still], unit[self._still] = 0.0, 1.0
         rows = spdiag(self._matrix(-scale))
-        jacobian = self._sparse([[spdiag(self._matrix(unit)) + rows * dae.fx, dae.gx], [rows * dae.fy, dae.gy]])
+        jacobian = self._sparse(
+            [[spdiag(self._matrix(unit)) + rows * dae.fx, dae.gx], [rows * dae.fy, dae.gy]]
+        )
         self._symbolic = self._klu.symbolic(jacobian)  # the pattern changes with the states at a limit
         self._factors = self._klu.numeric(jacobian, self._symbolic)
         self._jacobian = jacobian
         self._factored = (h, tuple(pegged.tolist()))
         self.factorisations += 1
 
-    def _correction(self, x0: Floats, f0: Floats, h: float, pegged: Integers) -> Floats:
+    def _correction(self, x0: Floats, f0: Floats, h: float) -> Floats:
         dae = self.dae
         residual = np.where(self.instant, -dae.f, self.T * (dae.x - x0) - 0.5 * h * (dae.f + f0))
-        residual[pegged] = 0.0
+        residual[self._still] = 0.0
         right = self._matrix(np.concatenate((residual, dae.g)))
         self._klu.solve(self._jacobian, self._symbolic, self._factors, right)
         return np.ravel(right)
@@ -118,11 +132,12 @@ class Stepper:
         last, size, worst = np.inf, np.inf, 0
         for iteration in range(limit):
             pegged = self.pegged()
-            refresh = self._factored != (h, tuple(pegged.tolist())) or size > SLOW * last
+            same = abs(self._factored[0] - h) <= 1e-6 * h and self._factored[1] == tuple(pegged.tolist())
+            refresh = not same or size > SLOW * last
             try:
                 if refresh:
                     self._factorise(h, pegged)
-                step = self._correction(x0, f0, h, pegged)
+                step = self._correction(x0, f0, h)
             except ArithmeticError:  # singular Jacobian
                 break
             if not np.isfinite(step).all():
@@ -138,12 +153,12 @@ class Stepper:
                 return
         dae.x[:], dae.y[:], dae.f[:] = x0, y0, f0
         self.system.vars_to_models()
-        raise NoConvergence(self.t + h, str(dae.xy_name[worst]))
+        raise NoConvergenceError(self.t + h, str(dae.xy_name[worst]))
 
     # -- what is called ------------------------------------------------------------------------------------
 
     def event(self, guess: Floats) -> None:
-        """Re-solve the algebraic equations at once from `guess`, after something in the network has changed."""
+        """Solve the algebraic equations from `guess`, after something in the network has changed."""
         self._factored = (-1.0, ())
         self.dae.y[:] = guess
         self.system.vars_to_models()
@@ -160,7 +175,7 @@ class Stepper:
             self.dae.t[...] = until
             self._newton(until - self.t, ITERATIONS, TOLERANCE)
             self.t = until
-        except NoConvergence:
+        except NoConvergenceError:
             if not halvings:
                 raise
             self._factored = (-1.0, ())

@@ -20,8 +20,8 @@ def first_crossing(t: Array, h: Array, rate: Array) -> tuple[int, dict[int, tupl
 
     Returns
     -------
-    interval number, and for each column that crosses in it the bracket (time where h <= 0 starts, time where
-    h > 0); None when nothing crosses.
+    interval number, and for each column that crosses in it the time at which the cubic does, and a time by which
+    it has; None when nothing crosses.
     """
     over = h[1:] > 0
     step = np.diff(t)[:, None]
@@ -31,23 +31,35 @@ def first_crossing(t: Array, h: Array, rate: Array) -> tuple[int, dict[int, tupl
     for i in candidates:
         found: dict[int, tuple[float, float]] = {}
         for k in np.flatnonzero(over[i]):
-            found[int(k)] = (float(t[i]), float(t[i + 1]))
+            s = _rise(1.0, float(step[i, 0]), h[i, k], rate[i, k], h[i + 1, k], rate[i + 1, k])
+            found[int(k)] = (float(t[i]) + s * float(step[i, 0]), float(t[i + 1]))
         for k in np.flatnonzero(hump[i]):
             peak = _peak(float(step[i, 0]), h[i, k], rate[i, k], h[i + 1, k], rate[i + 1, k])
             if peak is not None:
-                found[int(k)] = (float(t[i]), float(t[i]) + peak)
+                s = _rise(peak, float(step[i, 0]), h[i, k], rate[i, k], h[i + 1, k], rate[i + 1, k])
+                found[int(k)] = (float(t[i]) + s * float(step[i, 0]), float(t[i]) + peak * float(step[i, 0]))
         if found:
             return int(i), found
     return None
 
 
 def _peak(step: float, a: float, da: float, b: float, db: float) -> float | None:
-    """Where the cubic through two samples with slopes is largest inside, if it is above zero there."""
+    """Fraction of the step at which the cubic through two samples is largest inside, if it is above zero there."""
     c1, c2, c3 = da * step, 3 * (b - a) - (2 * da + db) * step, (da + db) * step - 2 * (b - a)
     for s in quadratic_roots(3 * c3, 2 * c2, c1):
         if 0 < s < 1 and a + s * (c1 + s * (c2 + s * c3)) > 0:
-            return s * step
+            return s
     return None
+
+
+def _rise(high: float, step: float, a: float, da: float, b: float, db: float) -> float:
+    """Fraction in [0, high] at which the cubic through two samples with slopes rises through zero, by bisection."""
+    c1, c2, c3 = da * step, 3 * (b - a) - (2 * da + db) * step, (da + db) * step - 2 * (b - a)
+    low = 0.0
+    for _ in range(40):
+        s = 0.5 * (low + high)
+        low, high = (low, s) if a + s * (c1 + s * (c2 + s * c3)) > 0 else (s, high)
+    return high
 
 
 def quadratic_roots(a: float, b: float, c: float) -> list[float]:

@@ -210,15 +210,15 @@ class Run:
 
     def _cross(self, brackets: dict[int, tuple[float, float]], sample: float) -> None:
         """Locate the earliest of the crossings after the present sample, and handle it."""
-        signs, left = self._signs(), (self.t, self.X, self.Z)
+        signs = self._signs()
         brackets = dict(brackets)
         best: tuple[float, Array, Array, int] | None = None
         while brackets:
-            row, (_, upper) = min(brackets.items(), key=lambda item: item[1][1])
+            row, (guess, upper) = min(brackets.items(), key=lambda item: item[1])
             del brackets[row]
-            if best is not None and upper > best[0]:
-                upper = best[0]
-            found = self._locate(row, float(signs[row]), left[0], upper)
+            if best is not None:
+                upper = min(upper, best[0])
+            found = self._locate(row, float(signs[row]), self.t, upper, min(guess, upper))
             if found is not None and (best is None or found[0] < best[0] - SAME_INSTANT):
                 best = (*found, row)
         if best is None:  # the samples promised a crossing that the solution does not have: go on from the next
@@ -243,33 +243,41 @@ class Run:
         _, X, Z, _ = self._integrate(np.array([self.t]), np.array([t]), 1)
         return X[-1].copy(), Z[-1].copy()
 
-    def _locate(self, row: int, sign: float, low: float, high: float) -> tuple[float, Array, Array] | None:
-        """Time at which sign * guard rises through zero in [low, high], by a bracketed Newton method."""
+    def _locate(
+        self, row: int, sign: float, low: float, high: float, guess: float
+    ) -> tuple[float, Array, Array] | None:
+        """Time at which sign * guard rises through zero in [low, high]: Newton from a guess, bracketed if it strays.
+
+        None when the guard is not above zero at `high` after all.
+        """
 
         def look(t: float) -> tuple[float, float, Array, Array]:
             X, Z = self._to(t)
             guard, rate = self.model.at("look", t, X, Z, self.P, self.inputs.C[self.k])
             return sign * float(guard[row, 0]), sign * float(rate[row, 0]), X, Z
 
+        t = guess
+        for _ in range(6):
+            value, rate, X, Z = look(t)
+            if not rate > 0:
+                break
+            step = value / rate
+            if abs(step) <= LOCATED:
+                return t, X, Z
+            t -= step
+            if not low <= t <= high:
+                break
         value, rate, X, Z = look(high)
         if not value > 0:
             return None
-        t, below = high, low
-        for _ in range(100):
+        t = high
+        while high - low > LOCATED:
             step = value / rate if rate > 0 else math.inf
             if abs(step) <= LOCATED:
-                return t, X, Z
-            new = t - step
-            if not below < new < high:
-                new = 0.5 * (below + high)
-            if high - below <= LOCATED:
-                return t, X, Z
-            t = new
+                break
+            t = t - step if low < t - step < high else 0.5 * (low + high)
             value, rate, X, Z = look(t)
-            if value > 0:
-                high = t
-            else:
-                below = t
+            low, high = (low, t) if value > 0 else (t, high)
         return t, X, Z
 
     def _time_gradient(self, row: int) -> Array:

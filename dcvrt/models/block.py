@@ -227,7 +227,10 @@ class Block:
         return ()
 
     def rest(self, s: Any) -> Mapping[str, Scalar]:
-        """Start values of states as functions of inputs and parameters, for the search of the equilibrium."""
+        """Start values of states as functions of inputs and parameters, for the search of the equilibrium.
+
+        Where these lead in a ring from a state back to itself, the declared `start` is taken instead.
+        """
         return {}
 
     # ---- use ------------------------------------------------------------------------------------------

@@ -297,16 +297,15 @@ def start_values(
     for a in automata:
         flags = a.flags[a.mode_number(a.start)]
         guess = ca.substitute(guess, stack([a.q, a.clock]), stack([*flags, 0.0]))
-    # a guess may rest on other guesses; put them in until none is left
+    # a guess may rest on other guesses: put them in; those in a ring begin at their declared start
     xz = stack([x, z])
-    for _ in range(xz.numel() + 1):
-        if xz.numel() == 0 or not ca.depends_on(guess, xz):
-            done: ca.SX = ca.cse(guess)
-            return done
-        guess = ca.cse(ca.substitute(guess, xz, guess))
-    names = [f"{name}.{state.name}" for name, state in flat.states()]
-    circular = [name for k, name in enumerate(names) if ca.depends_on(guess[k], xz)]
-    raise ModelError(
-        f"{flat.diagram.name}: start values depend on each other: {', '.join(circular)}. "
-        "Let rest() of one of these blocks give a number."
-    )
+    n = xz.numel()
+    reach = np.array(ca.DM(ca.jacobian(guess, xz).sparsity(), 1).full()) != 0
+    for k in range(n):
+        reach |= np.outer(reach[:, k], reach[k])
+    declared = [state.start for _, state in flat.states()] + [unknown.row.value for unknown in unknowns]
+    guess = stack(ca.SX(declared[k]) if reach[k, k] else guess[k] for k in range(n))
+    for _ in range(n):
+        guess = ca.substitute(guess, xz, guess)
+    done: ca.SX = ca.cse(guess)
+    return done

@@ -34,7 +34,7 @@ class DcEnergyLoop(Block):
     beta = Parameter(1.15, "1", (0.5, 3.0), "converter rating over hosted capacity", "illustrative")
     pf = Parameter(0.98, "1", (0.8, 1.0), "power factor of the import, lagging", "illustrative")
     K_p = Parameter(
-        4.0, "1", (0.01, 100.0), "proportional gain over H", "illustrative, see facility"
+        4.0, "1", (0.01, 100.0), "proportional gain over H", "illustrative: half the current loop's"
     )
     K_i = Parameter(20.0, "1/s", (0.0, 1000.0), "integral gain over H", "illustrative")
     eps = Parameter(

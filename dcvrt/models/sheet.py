@@ -120,7 +120,9 @@ def sheet(diagram: Diagram) -> str:
             )
             short = shortener(name)
             transitions = block.transitions(block.symbols(name))
-            rows_of_modes = [(r.source, r.target, short(str(r.when)), short(str(r.held))) for r in transitions]
+            rows_of_modes = [
+                (r.source, r.target, short(str(r.when)), short(str(r.held))) for r in transitions
+            ]
             parts.append(table(("from", "to", "when", "held (s)"), rows_of_modes))
     notes = [f"- **{name}**: {note}" for name, block in diagram.blocks.items() for note in block.notes()]
     if notes:

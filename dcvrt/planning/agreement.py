@@ -30,9 +30,10 @@ class Agreement:
     """Moves the screen to the optimum, pass by pass, until AC power flow says the same.
 
     Only hours near a limit are solved. The guard band of a bus is at least `WIDENING` times the largest error
-    found there, so an hour left out would need an error that much larger to reach a limit; `check_ac` solves all. Tangents from earlier passes stay as cuts while
-    they exclude nothing that AC power flow allows (`Tangent.bounds`); with voltages concave in H that is always
-    so, and the passes converge also where fewer limits bind than there are sites.
+    found there, so an hour left out would need an error that much larger to reach a limit; `check_ac`
+    solves all. Tangents from earlier passes stay as cuts while they exclude nothing that AC power flow
+    allows (`Tangent.bounds`); with voltages concave in H that is always so, and the passes converge also
+    where fewer limits bind than there are sites.
     """
 
     def __init__(self, screen: VoltageScreen, repeat: bool) -> None:
@@ -42,7 +43,7 @@ class Agreement:
         self.error, self.lowest, self.highest = 0.0, np.nan, np.nan
 
     def reached(self, solution: Solution, master: Master) -> bool:
-        """Compare at the optimum; when they differ, linearise again, renew the cuts of `master` and say no."""
+        """Compare at the optimum; if they differ, linearise again and renew the cuts of `master`."""
         screen, H = self.screen, solution.H
         hours, v = self._solve_near_limits(H)
         if not self.repeat:
@@ -52,19 +53,28 @@ class Agreement:
         place = {int(hour): k for k, hour in enumerate(hours)}
         tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
         tight = [t for t in tangents if t.side * (t.limit - t.constant - t.slope @ H) < AGREED_AT_LIMITS]
-        at_limits = max((abs(t.constant + t.slope @ H - size[t.bus, place[t.hour]]) for t in tight), default=0.0)
+        at_limits = max(
+            (abs(t.constant + t.slope @ H - size[t.bus, place[t.hour]]) for t in tight), default=0.0
+        )
         if max(-room.min(), at_limits) <= AGREED_AT_LIMITS and self.error <= AGREED_EVERYWHERE:
             return True
         self.passes += 1
         if self.passes > PASSES:
             bus, k = np.unravel_index(room.argmin(), room.shape)
             raise SimulationError(
-                f"Voltage screen and AC power flow still differ by {max(-room.min(), at_limits):.2g} pu after {PASSES} "
-                f"linearisations, most at bus {screen.network.bus[screen.pq[bus]]} in hour {screen.year.hours[hours[k]]}. "
-                "Ways out: a smaller h_max, or voltage_screen='one-shot' with check_ac.")
+                "Voltage screen and AC power flow still differ by "
+                f"{max(-room.min(), at_limits):.2g} pu after {PASSES} linearisations, most at bus "
+                f"{screen.network.bus[screen.pq[bus]]} in hour {screen.year.hours[hours[k]]}. "
+                "Ways out: a smaller h_max, or voltage_screen='one-shot' with check_ac."
+            )
         screen.relinearise(H, hours, v, np.flatnonzero(room.min(axis=0) < STEEP))
-        kept = [cut for cut in master.cuts if not isinstance(cut.origin, Tangent) or cut.origin.hour not in place
-                or cut.origin.bounds(H, size[cut.origin.bus, place[cut.origin.hour]])]
+        kept = [
+            cut
+            for cut in master.cuts
+            if not isinstance(cut.origin, Tangent)
+            or cut.origin.hour not in place
+            or cut.origin.bounds(H, size[cut.origin.bus, place[cut.origin.hour]])
+        ]
         moved = dict.fromkeys(t.key for t in tangents if t.hour in place)
         renewed = [screen.tangent(*key) for key in moved]
         master.cuts = kept + [Cut(*t.cut(), origin=t) for t in renewed]
@@ -84,6 +94,8 @@ class Agreement:
             error = np.maximum(error, abs(abs(fresh[screen.pq]) - linear[:, hours]).max(axis=1))
             solved, v = np.r_[solved, hours], np.hstack([v, fresh])
             self.guard = np.maximum(GUARD, WIDENING * error)
+            if not self.repeat:
+                break  # a sample is enough to tell how wrong it is
             near = (room < self.guard[:, None]).any(axis=0)
             near[solved] = False
             hours = np.flatnonzero(near)
@@ -98,5 +110,14 @@ class Agreement:
         """What to tell about the last comparison."""
         linear = self.screen.voltages(H)
         room = np.minimum(linear - self.screen.lower, self.screen.upper - linear).min(axis=0)
-        return VoltageInfo("relinearised" if self.repeat else "one-shot", self.passes, float(self.guard.max()),
-                           self.checked, self.error, self.lowest, self.highest, self.screen.widened, room)
+        return VoltageInfo(
+            "relinearised" if self.repeat else "one-shot",
+            self.passes,
+            float(self.guard.max()),
+            self.checked,
+            self.error,
+            self.lowest,
+            self.highest,
+            self.screen.widened,
+            room,
+        )

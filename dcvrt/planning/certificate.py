@@ -1,4 +1,4 @@
-"""Feasibility of every hour at given capacities: a dispatch for each, or a cut that forbids the capacities."""
+"""Feasibility of every hour at given capacities: a dispatch for each, or a cut that forbids them."""
 
 from __future__ import annotations
 
@@ -140,6 +140,11 @@ class Hours:
         up = np.maximum(short, 0.0) / max((high - units).sum(), 1e-9)
         down = np.minimum(short, 0.0) / max((units - low).sum(), 1e-9)
         ptdf = self.dispatcher.units_ptdf
-        total = flow + (ptdf @ units)[:, None] + np.outer(ptdf @ (high - units), up) + np.outer(ptdf @ (units - low), down)
+        total = (
+            flow
+            + (ptdf @ units)[:, None]
+            + np.outer(ptdf @ (high - units), up)
+            + np.outer(ptdf @ (units - low), down)
+        )
         within = (abs(total) <= self.network.branches.rating[:, None] + 1e-2 * TOLERANCE_MW).all(axis=0)
         return np.asarray(within & (up <= 1.0) & (down >= -1.0))

@@ -63,13 +63,14 @@ class HostingProblem:
     h_max, min_size : float or mapping of bus number to float
         Largest capacity of a site, and the smallest that is worth opening it, MW.
     voltage_screen : str
-        `relinearised`: repeated until AC power flow agrees. `one-shot`: linearised once with nothing hosted, as
-        the paper prints it; it can overstate the capacity.
+        `relinearised`: repeated until AC power flow agrees. `one-shot`: linearised once with nothing
+        hosted, as the paper prints it; it can overstate the capacity.
     base_violations : str
-        What to do with voltages outside the limits before anything is hosted. `error`: raise. `hold`: they must
-        only not get worse; `plan.voltage.widened` counts them.
+        What to do with voltages outside the limits before anything is hosted. `error`: raise. `hold`: they
+        must only not get worse; `plan.voltage.widened` counts them.
     hull : bool
-        Look at the corner hours of the convex hull of the operating parameters only, which is exact and quicker.
+        Look at the corner hours of the convex hull of the operating parameters only, which is exact and
+        quicker.
 
     Raises
     ------
@@ -77,16 +78,32 @@ class HostingProblem:
         With everything that is wrong with the arguments.
     """
 
-    def __init__(self, network: Network, sites: Sequence[int], hours: Year, rating_scale: float = 1.0,
-                 voltage: tuple[float, float] | None = (0.94, 1.06), pf: float = 0.98,
-                 h_max: float | Mapping[int, float] = 500.0, min_size: float | Mapping[int, float] = 0.0, *,
-                 voltage_screen: str = "relinearised", base_violations: str = "error", hull: bool = True) -> None:
+    def __init__(
+        self,
+        network: Network,
+        sites: Sequence[int],
+        hours: Year,
+        rating_scale: float = 1.0,
+        voltage: tuple[float, float] | None = (0.94, 1.06),
+        pf: float = 0.98,
+        h_max: float | Mapping[int, float] = 500.0,
+        min_size: float | Mapping[int, float] = 0.0,
+        *,
+        voltage_screen: str = "relinearised",
+        base_violations: str = "error",
+        hull: bool = True,
+    ) -> None:
         sites = tuple(sites)
-        problems = _argument_faults(network, sites, hours, rating_scale, voltage, pf, voltage_screen, base_violations)
+        problems = _argument_faults(
+            network, sites, hours, rating_scale, voltage, pf, voltage_screen, base_violations
+        )
         upper = _per_site("h_max", h_max, sites, problems)
         lower = _per_site("min_size", min_size, sites, problems)
-        problems += [f"min_size {low:g} MW at site {bus} exceeds its h_max {high:g} MW."
-                     for bus, low, high in zip(sites, lower, upper, strict=True) if low > high]
+        problems += [
+            f"min_size {low:g} MW at site {bus} exceeds its h_max {high:g} MW."
+            for bus, low, high in zip(sites, lower, upper, strict=True)
+            if low > high
+        ]
         raise_all(problems, "hosting problem")
         lines = network.branches
         self.network = replace(network, branches=replace(lines, rating=lines.rating * rating_scale))
@@ -101,7 +118,7 @@ class HostingProblem:
 
     @cached_property
     def certifier(self) -> Hours:
-        """The hours as dispatch problems; building it raises `InfeasibleError` when the base case has none."""
+        """The hours as dispatch problems; raises `InfeasibleError` when the base case has no dispatch."""
         hours = Hours(self.network, self.network.indices(self.sites), self.year, self._hull)
         if hours.certify(np.zeros(len(self.sites))) is not None:
             raise InfeasibleError(report.base_case(hours, self.rating_scale))
@@ -114,14 +131,16 @@ class HostingProblem:
 
     @cached_property
     def screen(self) -> VoltageScreen | None:
-        """The linear voltages; building it raises `InfeasibleError` when the base case violates the limits."""
+        """The linear voltages; raises `InfeasibleError` when the base case violates the limits."""
         if self.voltage is None:
             return None
         return VoltageScreen(self.ac, self.voltage, self._base_violations)
 
     # -- solving -------------------------------------------------------------------------------------------
 
-    def solve(self, rows: Iterable[Row] = (), bounds: Mapping[int, tuple[float, float]] | None = None) -> Plan:
+    def solve(
+        self, rows: Iterable[Row] = (), bounds: Mapping[int, tuple[float, float]] | None = None
+    ) -> Plan:
         """Find the largest plan.
 
         Parameters
@@ -130,8 +149,8 @@ class HostingProblem:
             Further requirements, for instance ride-through margins. A row that belongs to a site holds only
             while the site is open: where it cannot be met, the site is closed and `plan.closed` says so.
         bounds : mapping of bus number to (low, high), optional
-            Range in which an open site must lie, MW, for instance the sampled domain of a surrogate; it narrows
-            `min_size` and `h_max`.
+            Range in which an open site must lie, MW, for instance the sampled domain of a surrogate; it
+            narrows `min_size` and `h_max`.
 
         Returns
         -------
@@ -159,10 +178,11 @@ class HostingProblem:
         gap = 0.0
         while True:
             chosen = master.choose() if master.may_close else _all_open(len(self.sites))
-            if chosen is None or tuple(chosen.open) in tried:
+            if chosen is None:
                 break
-            if best is not None and chosen.total <= best[0].total + TOTAL_TOLERANCE:
-                gap = max(0.0, chosen.total - best[0].total) / max(best[0].total, 1.0)
+            more = np.inf if best is None else chosen.total - best[0].total
+            if more <= TOTAL_TOLERANCE or tuple(chosen.open) in tried:
+                gap = 0.0 if best is None else max(0.0, more) / max(best[0].total, 1.0)
                 break
             tried.add(tuple(chosen.open))
             floor = -np.inf if best is None else best[0].total + TOTAL_TOLERANCE
@@ -170,12 +190,16 @@ class HostingProblem:
             settled = self._settle(master, chosen.open, floor, agreement)
             if settled is not None:
                 best = settled, hours.certificate, None if agreement is None else agreement.info(settled.H)
+            if not master.may_close:
+                break
         if best is None:
             raise InfeasibleError(report.no_plan(rows))
         solution, certificate, voltage = best
         return report.plan(self, master, solution, certificate, voltage, gap)
 
-    def _settle(self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None) -> Solution | None:
+    def _settle(
+        self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None
+    ) -> Solution | None:
         """Optimum for given open sites, all hours certified; None when there is none above `floor` MW."""
         while True:
             solution = master.solve(is_open)
@@ -208,24 +232,31 @@ class HostingProblem:
             if bus not in self.sites:
                 problems.append(f"{bus!r} is not a site.{did_you_mean(bus, self.sites)}")
             elif not 0 <= low <= high < np.inf:
-                problems.append(f"the range of site {bus} is {low:g} to {high:g} MW; it must be ascending and not negative.")
+                problems.append(
+                    f"the range of site {bus} is {low:g} to {high:g} MW; "
+                    "it must be ascending and not negative."
+                )
             else:
                 i = self.sites.index(bus)
                 lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
                 if lower[i] > upper[i]:
-                    problems.append(f"the range of site {bus}, {low:g} to {high:g} MW, has nothing in common with "
-                                    f"its sizes {self.lower[i]:g} to {self.upper[i]:g} MW.")
+                    problems.append(
+                        f"the range of site {bus}, {low:g} to {high:g} MW, has nothing in common with "
+                        f"its sizes {self.lower[i]:g} to {self.upper[i]:g} MW."
+                    )
         raise_all(problems, "bounds")
         return lower, upper
 
     # -- checking ------------------------------------------------------------------------------------------
 
     def dispatch(self, plan: Plan, hour: int) -> Floats:
-        """Unit outputs that serve an hour of the year within all branch and unit limits, MW, in unit order."""
+        """Unit outputs that serve an hour of the year within all limits of branches and units, MW."""
         at = int(self.year.positions([hour])[0])
         found = self.certifier.dispatch(self._vector(plan), at)
         if found.shortfall > self.certifier.certificate.tolerance_mw:
-            raise InfeasibleError(f"hour {hour}: these capacities have no dispatch, {found.shortfall:.4g} MW are short.")
+            raise InfeasibleError(
+                f"hour {hour}: these capacities have no dispatch, {found.shortfall:.4g} MW are short."
+            )
         return found.units
 
     def check_ac(self, plan: Plan) -> AcVerdict:
@@ -235,8 +266,13 @@ class HostingProblem:
     def _vector(self, plan: Plan) -> Floats:
         return np.array([plan.by_site[bus] for bus in self.sites])
 
-    def write_mps(self, path: str | Path, hours: Iterable[int] | None = None, rows: Sequence[Row] = (),
-                  around: Plan | None = None) -> None:
+    def write_mps(
+        self,
+        path: str | Path,
+        hours: Iterable[int] | None = None,
+        rows: Sequence[Row] = (),
+        around: Plan | None = None,
+    ) -> None:
         """Write the problem whole, angles and all rows, for any solver to check.
 
         Parameters
@@ -267,38 +303,66 @@ def _tangent_cut(tangent: Tangent) -> Cut:
     return Cut(a, b, tangent)
 
 
-def _argument_faults(network: Network, sites: tuple[int, ...], hours: Year, rating_scale: float,
-                     voltage: tuple[float, float] | None, pf: float, screen: str, base: str) -> list[str]:
+def _argument_faults(
+    network: Network,
+    sites: tuple[int, ...],
+    hours: Year,
+    rating_scale: float,
+    voltage: tuple[float, float] | None,
+    pf: float,
+    screen: str,
+    base: str,
+) -> list[str]:
     known = set(network.bus.tolist())
-    problems = [f"site {bus!r} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
-                for bus in sites if bus not in known]
-    problems += [f"wind bus {bus} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
-                 for bus in hours.wind if bus not in known]
+    problems = [
+        f"site {bus!r} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
+        for bus in sites
+        if bus not in known
+    ]
+    problems += [
+        f"wind bus {bus} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
+        for bus in hours.wind
+        if bus not in known
+    ]
     if not sites:
         problems.append("needs at least one site.")
-    problems += [f"site {bus} is listed more than once." for bus in sorted({b for b in sites if sites.count(b) > 1})]
+    problems += [
+        f"site {bus} is listed more than once." for bus in sorted({b for b in sites if sites.count(b) > 1})
+    ]
     if not 0 < rating_scale < np.inf:
         problems.append(f"rating_scale is {rating_scale:g}; it must be a finite number above 0.")
     if voltage is not None and not 0 < voltage[0] < voltage[1] < np.inf:
         problems.append(f"voltage limits {voltage[0]:g} to {voltage[1]:g} pu must be positive and ascending.")
     if not 0 < pf <= 1:
         problems.append(f"pf is {pf:g}; it must be above 0 and at most 1.")
-    for name, value, choices in (("voltage_screen", screen, SCREENS), ("base_violations", base, BASE_VIOLATIONS)):
+    for name, value, choices in (
+        ("voltage_screen", screen, SCREENS),
+        ("base_violations", base, BASE_VIOLATIONS),
+    ):
         if value not in choices:
             problems.append(f"{name} {value!r} is unknown.{did_you_mean(value, choices)}")
     return problems
 
 
-def _per_site(name: str, value: float | Mapping[int, float], sites: tuple[int, ...], problems: list[str]) -> Floats:
+def _per_site(
+    name: str, value: float | Mapping[int, float], sites: tuple[int, ...], problems: list[str]
+) -> Floats:
     """A size for every site, from one number or a mapping that names all sites."""
     if isinstance(value, Mapping):
-        problems += [f"{name} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}" for bus in value if bus not in sites]
+        problems += [
+            f"{name} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
+            for bus in value
+            if bus not in sites
+        ]
         problems += [f"{name} says nothing about site {bus}." for bus in sites if bus not in value]
         sizes = np.array([float(value.get(bus, 0.0)) for bus in sites])
     else:
         sizes = np.full(len(sites), float(value))
-    problems += [f"{name} of site {bus} is {mw:g} MW; it must be finite and not negative."
-                 for bus, mw in zip(sites, sizes, strict=True) if not 0 <= mw < np.inf]
+    problems += [
+        f"{name} of site {bus} is {mw:g} MW; it must be finite and not negative."
+        for bus, mw in zip(sites, sizes, strict=True)
+        if not 0 <= mw < np.inf
+    ]
     return sizes
 
 
@@ -306,10 +370,11 @@ def _row_faults(rows: tuple[Row, ...], sites: tuple[int, ...]) -> list[str]:
     problems = []
     for row in rows:
         named = [*row.coefficients, *([] if row.site is None else [row.site])]
-        problems += [f"row {row.label!r} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
-                     for bus in dict.fromkeys(named) if bus not in sites]
+        problems += [
+            f"row {row.label!r} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
+            for bus in dict.fromkeys(named)
+            if bus not in sites
+        ]
         if not np.isfinite([row.lower, *row.coefficients.values()]).all():
             problems.append(f"row {row.label!r} has a coefficient or a limit that is not finite.")
     return problems
-
-

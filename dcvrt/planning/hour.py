@@ -94,8 +94,12 @@ class HourDispatch:
             branch, sign = self._row_arrays()
             high = network.branches.rating[branch] - sign * fixed[branch]
             count = len(branch) + 1
-            self._solver.changeRowsBounds(count, np.arange(count, dtype=np.int32),
-                                          np.r_[demand, np.full(len(branch), -self._inf)], np.r_[demand, high])
+            self._solver.changeRowsBounds(
+                count,
+                np.arange(count, dtype=np.int32),
+                np.r_[demand, np.full(len(branch), -self._inf)],
+                np.r_[demand, high],
+            )
             self._solver.run()
             self.solved += 1
             if self._solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
@@ -122,15 +126,20 @@ class HourDispatch:
                 continue  # within the solver's tolerance of its row
             weights = key[1] * self.units_ptdf[b]
             used = np.flatnonzero(abs(weights) > 1e-12)
-            self._solver.addRow(-self._inf, 0.0, len(used) + 1,
-                                np.r_[used, len(self.p_min)].astype(np.int32), np.r_[weights[used], -1.0])
+            self._solver.addRow(
+                -self._inf,
+                0.0,
+                len(used) + 1,
+                np.r_[used, len(self.p_min)].astype(np.int32),
+                np.r_[weights[used], -1.0],
+            )
             self._known.add(key)
             self._rows.append(key)
             added = True
         return added
 
     def _dual(self, row_dual: Floats) -> FlowCut:
-        """Turn row duals into a cut that is valid whatever their rounding: projected, constants recomputed."""
+        """Turn row duals into a cut that holds whatever their rounding: clipped, its constant recomputed."""
         network = self.network
         branch, sign = self._row_arrays()
         y = np.minimum(row_dual[1:], 0.0)
@@ -139,9 +148,15 @@ class HourDispatch:
         by_branch = np.bincount(branch, y * sign, len(network.branches))
         pi = -(y0 + by_branch @ network.ptdf())
         reduced = -(y0 + by_branch @ self.units_ptdf)
-        constant = (y @ network.branches.rating[branch] - by_branch @ network.shift_flow
-                    + np.where(reduced > 0, reduced * self.p_min, reduced * self.p_max).sum())
+        constant = (
+            y @ network.branches.rating[branch]
+            - by_branch @ network.shift_flow
+            + np.where(reduced > 0, reduced * self.p_min, reduced * self.p_max).sum()
+        )
         weight = np.bincount(branch, -y, len(network.branches))
         lines = tuple((int(b), float(weight[b])) for b in np.flatnonzero(weight > 1e-9))
-        units = tuple((int(g), float(abs(reduced[g])), bool(reduced[g] < 0)) for g in np.flatnonzero(abs(reduced) > 1e-9))
+        units = tuple(
+            (int(g), float(abs(reduced[g])), bool(reduced[g] < 0))
+            for g in np.flatnonzero(abs(reduced) > 1e-9)
+        )
         return FlowCut(pi, float(constant), lines, units)

@@ -26,15 +26,28 @@ def highs() -> highspy.Highs:
     import highspy
 
     solver = highspy.Highs()
-    for option, value in (("output_flag", False), ("threads", 1), ("mip_rel_gap", 0.0), ("mip_abs_gap", 1e-9),
-                          ("primal_feasibility_tolerance", TOLERANCE), ("dual_feasibility_tolerance", TOLERANCE),
-                          ("mip_feasibility_tolerance", TOLERANCE)):
+    for option, value in (
+        ("output_flag", False),
+        ("threads", 1),
+        ("mip_rel_gap", 0.0),
+        ("mip_abs_gap", 1e-9),
+        ("primal_feasibility_tolerance", TOLERANCE),
+        ("dual_feasibility_tolerance", TOLERANCE),
+        ("mip_feasibility_tolerance", TOLERANCE),
+    ):
         solver.setOptionValue(option, value)
     return solver
 
 
-def model(cost: Floats, lower: Floats, upper: Floats, matrix: Any, row_lower: Floats, row_upper: Floats,
-          whole: Flags | None = None) -> highspy.HighsLp:
+def model(
+    cost: Floats,
+    lower: Floats,
+    upper: Floats,
+    matrix: Any,
+    row_lower: Floats,
+    row_upper: Floats,
+    whole: Flags | None = None,
+) -> highspy.HighsLp:
     """A HiGHS model that maximises `cost` over a scipy matrix of rows; `whole` columns are integer."""
     import highspy
 
@@ -116,10 +129,15 @@ class Master:
         n = len(self.sites)
         cut_a, cut_b = self._cut_arrays()
         choice, low, high = self.with_choice()
-        found = self._run(np.r_[np.ones(n), np.zeros(n)], np.zeros(2 * n), np.r_[self.upper, np.ones(n)],
-                          np.vstack([np.hstack([cut_a, np.zeros((len(cut_b), n))]), choice]),
-                          np.r_[np.full(len(cut_b), -np.inf), low], np.r_[cut_b, high],
-                          np.r_[np.zeros(n, bool), np.ones(n, bool)])
+        found = self._run(
+            np.r_[np.ones(n), np.zeros(n)],
+            np.zeros(2 * n),
+            np.r_[self.upper, np.ones(n)],
+            np.vstack([np.hstack([cut_a, np.zeros((len(cut_b), n))]), choice]),
+            np.r_[np.full(len(cut_b), -np.inf), low],
+            np.r_[cut_b, high],
+            np.r_[np.zeros(n, bool), np.ones(n, bool)],
+        )
         if found is None:
             return None
         values, total, _, _ = found
@@ -132,10 +150,18 @@ class Master:
         relief = np.zeros((len(self.rows), n))
         on_site = self._site >= 0
         relief[np.flatnonzero(on_site), self._site[on_site]] = -self._relief[on_site]
-        matrix = np.block([[self.coefficients, relief], [np.eye(n), -np.diag(self.upper)],
-                           [np.eye(n), -np.diag(self.lower)]])
-        return (matrix, np.r_[self.required - self._relief, np.full(n, -np.inf), np.zeros(n)],
-                np.r_[np.full(len(self.rows), np.inf), np.zeros(n), np.full(n, np.inf)])
+        matrix = np.block(
+            [
+                [self.coefficients, relief],
+                [np.eye(n), -np.diag(self.upper)],
+                [np.eye(n), -np.diag(self.lower)],
+            ]
+        )
+        return (
+            matrix,
+            np.r_[self.required - self._relief, np.full(n, -np.inf), np.zeros(n)],
+            np.r_[np.full(len(self.rows), np.inf), np.zeros(n), np.full(n, np.inf)],
+        )
 
     def solve(self, is_open: Flags) -> Solution | None:
         """Optimum for given open sites, with prices, or None when they cannot all be open."""
@@ -145,13 +171,20 @@ class Master:
         matrix = np.vstack([cut_a, self.coefficients[holds]])
         low = np.r_[np.full(len(cut_b), -np.inf), self.required[holds]]
         high = np.r_[cut_b, np.full(int(holds.sum()), np.inf)]
-        found = self._run(np.ones(n), np.where(is_open, self.lower, 0.0), np.where(is_open, self.upper, 0.0),
-                          matrix, low, high, None)
+        found = self._run(
+            np.ones(n),
+            np.where(is_open, self.lower, 0.0),
+            np.where(is_open, self.upper, 0.0),
+            matrix,
+            low,
+            high,
+            None,
+        )
         if found is None:
             return None
         values, total, row_dual, reduced = found
         row_price = np.zeros(len(self.rows))
-        row_price[holds] = -row_dual[len(cut_b):]
+        row_price[holds] = -row_dual[len(cut_b) :]
         bound_price = np.where(is_open & (values >= self.upper), reduced, 0.0)
         return Solution(values, is_open, total, row_dual[: len(cut_b)], row_price, bound_price)
 
@@ -160,8 +193,15 @@ class Master:
         return a, np.array([cut.b for cut in self.cuts], dtype=float)
 
     @staticmethod
-    def _run(cost: Floats, lower: Floats, upper: Floats, matrix: Floats, low: Floats, high: Floats,
-             whole: Flags | None) -> tuple[Floats, float, Floats, Floats] | None:
+    def _run(
+        cost: Floats,
+        lower: Floats,
+        upper: Floats,
+        matrix: Floats,
+        low: Floats,
+        high: Floats,
+        whole: Flags | None,
+    ) -> tuple[Floats, float, Floats, Floats] | None:
         import highspy
         import scipy.sparse as sp
 
@@ -179,5 +219,9 @@ class Master:
             raise RuntimeError(f"HiGHS ended the master programme with {solver.modelStatusToString(status)}.")
         solution = solver.getSolution()
         dual = np.array(solution.row_dual) / size if whole is None else np.zeros(0)
-        return (np.array(solution.col_value), float(solver.getInfo().objective_function_value), dual,
-                np.array(solution.col_dual))
+        return (
+            np.array(solution.col_value),
+            float(solver.getInfo().objective_function_value),
+            dual,
+            np.array(solution.col_dual),
+        )

@@ -114,10 +114,10 @@ class VoltageInfo:
     passes : int
         Linearisations after the first.
     guard_pu : float
-        Widest guard band of a bus: hours in which the screen puts a voltage within its bus's band of a limit were
-        solved by AC power flow.
+        Widest guard band of a bus: hours in which the screen puts a voltage within its bus's band of a
+        limit were solved by AC power flow.
     checked : int
-        Number of these hours, with the worst hour of each bus.
+        Number of these hours, with the worst hour of each bus; with `one-shot` only the latter.
     v_error_pu : float
         Largest difference between AC power flow and screen among the voltages within their guard bands.
     v_min_pu, v_max_pu : float
@@ -186,8 +186,8 @@ class AcVerdict:
     v_min_pu, v_max_pu : float
         Extremes over `pq` buses and hours that have a solution.
     v_error_pu : float
-        Largest difference between AC and linear screen of the least distance to a limit, over the hours in which
-        either puts it below 5e-4 pu; elsewhere no limit is near and the screen may be cruder.
+        Largest difference between AC and linear screen of the least distance to a limit, over the hours in
+        which either puts it below 5e-4 pu; elsewhere no limit is near and the screen may be cruder.
     hour, bus : int or None
         Where the voltage is nearest to a limit, or farthest beyond it.
     status : str

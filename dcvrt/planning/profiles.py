@@ -31,12 +31,30 @@ DAILY = (93, 100, 98, 96, 94, 77, 75)
 """RTS-79 daily peak from Monday to Sunday, per cent of the weekly peak."""
 
 HOURLY = {
-    ("winter", "weekday"): (67, 63, 60, 59, 59, 60, 74, 86, 95, 96, 96, 95, 95, 95, 93, 94, 99, 100, 100, 96, 91, 83, 73, 63),
-    ("winter", "weekend"): (78, 72, 68, 66, 64, 65, 66, 70, 80, 88, 90, 91, 90, 88, 87, 87, 91, 100, 99, 97, 94, 92, 87, 81),
-    ("summer", "weekday"): (64, 60, 58, 56, 56, 58, 64, 76, 87, 95, 99, 100, 99, 100, 100, 97, 96, 96, 93, 92, 92, 93, 87, 72),
-    ("summer", "weekend"): (74, 70, 66, 65, 64, 62, 62, 66, 81, 86, 91, 93, 93, 92, 91, 91, 92, 94, 95, 95, 100, 93, 88, 80),
-    ("between", "weekday"): (63, 62, 60, 58, 59, 65, 72, 85, 95, 99, 100, 99, 93, 92, 90, 88, 90, 92, 96, 98, 96, 90, 80, 70),
-    ("between", "weekend"): (75, 73, 69, 66, 65, 65, 68, 74, 83, 89, 92, 94, 91, 90, 90, 86, 85, 88, 92, 100, 97, 95, 90, 85),
+    ("winter", "weekday"): (
+        67, 63, 60, 59, 59, 60, 74, 86, 95, 96, 96, 95,
+        95, 95, 93, 94, 99, 100, 100, 96, 91, 83, 73, 63,
+    ),
+    ("winter", "weekend"): (
+        78, 72, 68, 66, 64, 65, 66, 70, 80, 88, 90, 91,
+        90, 88, 87, 87, 91, 100, 99, 97, 94, 92, 87, 81,
+    ),
+    ("summer", "weekday"): (
+        64, 60, 58, 56, 56, 58, 64, 76, 87, 95, 99, 100,
+        99, 100, 100, 97, 96, 96, 93, 92, 92, 93, 87, 72,
+    ),
+    ("summer", "weekend"): (
+        74, 70, 66, 65, 64, 62, 62, 66, 81, 86, 91, 93,
+        93, 92, 91, 91, 92, 94, 95, 95, 100, 93, 88, 80,
+    ),
+    ("between", "weekday"): (
+        63, 62, 60, 58, 59, 65, 72, 85, 95, 99, 100, 99,
+        93, 92, 90, 88, 90, 92, 96, 98, 96, 90, 80, 70,
+    ),
+    ("between", "weekend"): (
+        75, 73, 69, 66, 65, 65, 68, 74, 83, 89, 92, 94,
+        91, 90, 90, 86, 85, 88, 92, 100, 97, 95, 90, 85,
+    ),
 }  # fmt: skip
 """RTS-79 hourly peak from midnight on, per cent of the daily peak."""
 
@@ -45,7 +63,7 @@ ILLUSTRATIVE_WIND = {69: 200.0, 80: 200.0, 89: 200.0}
 
 
 @dataclass(frozen=True)
-class Period:
+class Hour:
     """One operating hour.
 
     Parameters
@@ -99,7 +117,9 @@ class Year:
         object.__setattr__(self, "hours", np.array(self.hours, dtype=np.int64))
         object.__setattr__(self, "load", np.array(self.load, dtype=float))
         object.__setattr__(self, "dc", np.array(self.dc, dtype=float))
-        object.__setattr__(self, "wind", {int(bus): np.array(mw, dtype=float) for bus, mw in self.wind.items()})
+        object.__setattr__(
+            self, "wind", {int(bus): np.array(mw, dtype=float) for bus, mw in self.wind.items()}
+        )
         columns = {"load": self.load, "dc": self.dc, **{f"wind[{bus}]": mw for bus, mw in self.wind.items()}}
         problems = []
         if len(self.hours) == 0:
@@ -119,8 +139,8 @@ class Year:
                 more = f" ({int(wrong.sum())} hours in all)" if wrong.sum() > 1 else ""
                 problems.append(f"{name} {rule}; it is {values[k]:g} in hour {self.hours[k]}{more}.")
         raise_all(problems, "operating hours")
-        for values in (self.hours, *columns.values()):
-            values.flags.writeable = False
+        for column in (self.hours, *columns.values()):
+            column.flags.writeable = False
 
     def __len__(self) -> int:
         return len(self.hours)
@@ -140,8 +160,10 @@ class Year:
         wanted = [int(hour) for hour in hours]
         strange = [hour for hour in wanted if hour not in self._position]
         if strange:
-            raise InputError(f"hour {strange[0]} is not among the {len(self)} operating hours "
-                             f"({self.hours.min()} to {self.hours.max()}).")
+            raise InputError(
+                f"hour {strange[0]} is not among the {len(self)} operating hours "
+                f"({self.hours.min()} to {self.hours.max()})."
+            )
         return np.array([self._position[hour] for hour in wanted], dtype=np.int64)
 
     def window(self, hours: Iterable[int]) -> Year:
@@ -152,14 +174,23 @@ class Year:
         (168, 8400)
         """
         at = self.positions(hours)
-        return Year(self.hours[at], self.load[at], {bus: mw[at] for bus, mw in self.wind.items()}, self.dc[at],
-                    self.sources)
+        return Year(
+            self.hours[at],
+            self.load[at],
+            {bus: mw[at] for bus, mw in self.wind.items()},
+            self.dc[at],
+            self.sources,
+        )
 
-    def at(self, hour: int) -> Period:
+    def at(self, hour: int) -> Hour:
         """One hour, by its number in the year."""
         k = int(self.positions([hour])[0])
-        return Period(int(hour), float(self.load[k]), {bus: float(mw[k]) for bus, mw in self.wind.items()},
-                      float(self.dc[k]))
+        return Hour(
+            int(hour),
+            float(self.load[k]),
+            {bus: float(mw[k]) for bus, mw in self.wind.items()},
+            float(self.dc[k]),
+        )
 
     def net_load(self, network: Network) -> Floats:
         """System load less wind in each hour, MW, with nothing hosted."""
@@ -179,8 +210,11 @@ class Year:
         order = np.lexsort((self.hours, self.net_load(network)))
         largest = self.net_load(network).max()
         peak = self.hours[self.net_load(network) == largest].min()
-        return {"peak": int(peak), "median": int(self.hours[order[(len(order) - 1) // 2]]),
-                "light": int(self.hours[order[0]])}
+        return {
+            "peak": int(peak),
+            "median": int(self.hours[order[(len(order) - 1) // 2]]),
+            "light": int(self.hours[order[0]]),
+        }
 
 
 def rts79_load(hours: int = HOURS) -> Floats:
@@ -220,8 +254,8 @@ def data_centre_factor(hours: int = HOURS) -> Floats:
 
     .. math:: d_t = w_t \left(0.94 + 0.06 \cos\frac{2\pi (h_t - 15)}{24}\right)
 
-    with h_t the hour of the day and w_t = 1 on weekdays, 0.97 at weekends: flat, as such loads are, highest in
-    the afternoon when cooling is hardest, and 1 at its maximum.
+    with h_t the hour of the day and w_t = 1 on weekdays, 0.97 at weekends: flat, as such loads are, highest
+    in the afternoon when cooling is hardest, and 1 at its maximum.
 
     >>> d = data_centre_factor()
     >>> float(d.max()), round(float(d.min()), 4)
@@ -248,16 +282,26 @@ def ieee118(wind_mw: Mapping[int, float] | None = None) -> Year:
     capacity = ILLUSTRATIVE_WIND if wind_mw is None else wind_mw
     plants = rts_gmlc_wind()
     if len(capacity) > plants.shape[1]:
-        raise InputError(f"ieee118: {len(capacity)} wind buses, but only {plants.shape[1]} wind series ship. "
-                         "Way out: build a Year with your own series.")
-    wrong = [f"wind capacity at bus {bus} is {mw:g} MW; it must be 0 or more." for bus, mw in capacity.items() if not mw >= 0]
+        raise InputError(
+            f"ieee118: {len(capacity)} wind buses, but only {plants.shape[1]} wind series ship. "
+            "Way out: build a Year with your own series."
+        )
+    wrong = [
+        f"wind capacity at bus {bus} is {mw:g} MW; it must be 0 or more."
+        for bus, mw in capacity.items()
+        if not mw >= 0
+    ]
     raise_all(wrong, "ieee118")
     return Year(
-        hours=np.arange(HOURS), load=rts79_load(), dc=data_centre_factor(),
+        hours=np.arange(HOURS),
+        load=rts79_load(),
+        dc=data_centre_factor(),
         wind={bus: mw * plants[:, k] for k, (bus, mw) in enumerate(capacity.items())},
         sources={
-            "load": "IEEE Reliability Test System 1979, weekly x daily x hourly factors; week order as in SOURCE.md",
-            "wind": "RTS-GMLC day-ahead wind 2020 without 29 February (DOE/NREL/ALLIANCE), per unit; capacities "
-                    + ("illustrative" if wind_mw is None else "given by the user"),
+            "load": "IEEE Reliability Test System 1979, weekly x daily x hourly factors; "
+            "week order as in data/profiles/SOURCE.md",
+            "wind": "RTS-GMLC day-ahead wind 2020 without 29 February (DOE/NREL/ALLIANCE), per unit; "
+            "capacities " + ("illustrative" if wind_mw is None else "given by the user"),
             "dc": "illustrative: own daily and weekly curve with maximum 1",
-        })
+        },
+    )

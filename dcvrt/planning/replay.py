@@ -5,12 +5,13 @@ Samples and replays of plans go through the same function. It takes and gives pl
 process.
 
 A facility model is proportional to its size, so it runs on the base S_B = H (H = 1 pu); the size acts through the
-voltage waveform, and megawatts are shares times the site's import.
+voltage waveform. Megawatts are shares times P = d_t H, the load that the grid sees before the fault.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -73,9 +74,8 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         rows = []
         for mode in dict.fromkeys(mode for mode, _ in runs):
             betas = [beta for m, beta in runs if m == mode]
-            rows += _facility_rows(request, mode, betas, waveforms, hosting, period.dc_factor)
-        for row in rows:
-            answer["rows"].append({"period": period.name, "fault": label, **row})
+            rows += _facility_rows(request, period.name, label, mode, betas, waveforms, hosting, period.dc_factor)
+        answer["rows"] += rows
         answer["facility"] += len(rows)
         if keep:
             answer["waveforms"] += [
@@ -87,7 +87,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         kept = answer.pop("_waveforms", {})
         for mode, beta in runs:
             for fault, site in _worst(answer["rows"], hosting, mode, beta):
-                run = _simulator(mode, _frozen(request["parameters"].get(mode, {})), SAVE_AT)(
+                run = _simulator(mode, _frozen(request["parameters"].get(mode, {})))(
                     kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"]))
                 answer["waveforms"].append({"period": period.name, "fault": fault, "site": site, "mode": mode,
                                             "beta": beta, "signals": _signals(run)})
@@ -112,6 +112,21 @@ def fault_label(fault: Mapping[str, Any]) -> str:
     return f"bus {fault['bus']}, {fault['t_clear_ms']:g} ms"
 
 
+def prepare(request: Mapping[str, Any]) -> str:
+    """Make what is made once per machine: the grid simulator's code, the compiled facility of the request's first run.
+
+    Returns
+    -------
+    str
+        How the facility is evaluated: the compiler, or the interpreter and why.
+    """
+    from dcvrt.grid import andes
+
+    andes.prepare()
+    mode = request["runs"][0][0]
+    return _simulator(mode, _frozen(request["parameters"].get(mode, {}))).backend
+
+
 # -- the two halves -----------------------------------------------------------------------------------------------
 
 
@@ -132,15 +147,36 @@ def _fault_runs(request: Mapping[str, Any], hosting: Mapping[int, float],
             for fault, label in labels.items()]
 
 
-def _facility_rows(request: Mapping[str, Any], mode: str, betas: Sequence[float], waveforms: Mapping[int, Waveform],
-                   hosting: Mapping[int, float], d: float) -> list[dict[str, Any]]:
+def _facility_rows(request: Mapping[str, Any], period: str, fault: str, mode: str, betas: Sequence[float],
+                   waveforms: Mapping[int, Waveform], hosting: Mapping[int, float], d: float) -> list[dict[str, Any]]:
     """One mode at several ratings on the waveforms of one fault."""
-    simulator = _simulator(mode, _frozen(request["parameters"].get(mode, {})), None)
+    simulator = _simulator(mode, _frozen(request["parameters"].get(mode, {})))
     cases = [(site, beta) for site in waveforms for beta in betas]
     result = simulator.batch([waveforms[site] for site, _ in cases],
                              {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for _, beta in cases]},
                              criteria=_criteria(_frozen(request["criteria"])))
-    raise NotImplementedError
+    rows = []
+    for (site, beta), status, found in zip(cases, result.status, result.margins, strict=True):
+        row = _row(period, fault, site, mode, beta, hosting[site], status, "facility")
+        row |= {"p_mw": d * hosting[site], "v_poi_min_pu": float(np.abs(waveforms[site].v).min())}
+        if found is not None:
+            share, modes = found.diagnostics["loss_share"], modes_passed(found.sequence)
+            row |= {"v_margin_pu": found.voltage.value, "loss_margin_share": found.loss.value,
+                    "loss_margin_mw": found.loss.value * row["p_mw"], "loss_share": share,
+                    "loss_mw": share * row["p_mw"], "ok": 1, "failed_in": "", "sequence": ">".join(modes),
+                    "battery": int("BATTERY" in modes), "diagnostics": dict(found.diagnostics)}
+        rows.append(row)
+    return rows
+
+
+def modes_passed(sequence: Sequence[str]) -> list[str]:
+    """Modes in the order in which they were entered, from the event sequence of a run.
+
+    >>> modes_passed(("sup: NORMAL", "sup: NORMAL -> MIXED [v_f < V_dip]", "sup: MIXED -> NORMAL [v_f > V_back]"))
+    ['NORMAL', 'MIXED', 'NORMAL']
+    """
+    steps = [entry.split(": ", 1)[1].split(" [", 1)[0] for entry in sequence]
+    return [step.rsplit(" -> ", 1)[-1] for step in steps]
 
 
 # -- what a process keeps -----------------------------------------------------------------------------------------
@@ -155,14 +191,18 @@ def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, re
 
 
 @lru_cache(maxsize=16)
-def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...], save_at: float | None) -> Simulator:
+def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...]) -> Simulator:
     from dcvrt import facility
-    from dcvrt.integrators import Simulator
+    from dcvrt.integrators import NoCompilerWarning, Simulator
 
     diagram = facility.get(mode)
     for path, value in parameters:
         diagram.set(path, value)
-    return Simulator(diagram.compile(), save_at=save_at)
+    simulator = Simulator(diagram.compile(), save_at=SAVE_AT)
+    with warnings.catch_warnings():  # whoever starts a study is told by `prepare`, not by every worker
+        warnings.simplefilter("ignore", NoCompilerWarning)
+        simulator.backend  # noqa: B018 - compiles now
+    return simulator
 
 
 @lru_cache(maxsize=4)

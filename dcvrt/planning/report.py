@@ -28,13 +28,27 @@ PROGRAMMES = 300
 """Dispatch programmes spent on finding which hours of an infeasible base case are short."""
 
 
-def plan(problem: HostingProblem, master: Master, solution: Solution, certificate: Certificate,
-         voltage: VoltageInfo | None, gap: float) -> Plan:
+def plan(
+    problem: HostingProblem,
+    master: Master,
+    solution: Solution,
+    certificate: Certificate,
+    voltage: VoltageInfo | None,
+    gap: float,
+) -> Plan:
     """Put the optimum into words and numbers."""
     H = np.where(solution.H > CLOSED_MW, solution.H, 0.0)
     by_site = {bus: float(mw) for bus, mw in zip(problem.sites, H, strict=True)}
     binding = _binding(problem, master, solution)
-    return Plan(float(H.sum()), by_site, binding, _closed(master, solution, by_site, binding), certificate, gap, voltage)
+    return Plan(
+        float(H.sum()),
+        by_site,
+        binding,
+        _closed(master, solution, by_site, binding),
+        certificate,
+        gap,
+        voltage,
+    )
 
 
 def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tuple[Binding, ...]:
@@ -57,8 +71,17 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
             assert screen is not None
             bus = int(problem.network.bus[screen.pq[t.bus]])
             side = "at least" if t.side < 0 else "at most"
-            add(Binding("voltage", f"bus {bus} {side} {t.limit:g} pu", float(price), "MW/pu", t.limit,
-                        int(problem.year.hours[t.hour]), bus))
+            add(
+                Binding(
+                    "voltage",
+                    f"bus {bus} {side} {t.limit:g} pu",
+                    float(price),
+                    "MW/pu",
+                    t.limit,
+                    int(problem.year.hours[t.hour]),
+                    bus,
+                )
+            )
     for row, price in zip(master.rows, solution.row_price, strict=True):
         if price > NO_PRICE:
             add(Binding("row", row.label, float(price), "MW per unit", row.lower, bus=row.site))
@@ -74,30 +97,48 @@ def _flow_bindings(problem: HostingProblem, cut: FlowCut, price: float) -> list[
     at = int(problem.certifier.corners[problem.certifier.bound(cut).argmin()])
     hour, per_mw = int(year.hours[at]), price / year.dc[at]
     lines, units = network.branches, network.generators
-    found = [Binding("line", lines.label(b), float(weight * per_mw), "MW/MVA", float(lines.rating[b]), hour)
-             for b, weight in cut.lines if weight * per_mw > NO_PRICE]
+    found = [
+        Binding("line", lines.label(b), float(weight * per_mw), "MW/MVA", float(lines.rating[b]), hour)
+        for b, weight in cut.lines
+        if weight * per_mw > NO_PRICE
+    ]
     for g, weight, at_maximum in cut.units:
         limit = units.p_max[g] if at_maximum else units.p_min[g]
         if weight * per_mw > NO_PRICE and (at_maximum or limit != 0):
             what = "p_max" if at_maximum else "p_min"
-            found.append(Binding("generator", f"{units.name[g]} {what}", float(weight * per_mw), "MW/MW", float(limit), hour,
-                                 int(units.bus[g])))
+            found.append(
+                Binding(
+                    "generator",
+                    f"{units.name[g]} {what}",
+                    float(weight * per_mw),
+                    "MW/MW",
+                    float(limit),
+                    hour,
+                    int(units.bus[g]),
+                )
+            )
     return found
 
 
-def _closed(master: Master, solution: Solution, by_site: dict[int, float], binding: tuple[Binding, ...]) -> dict[int, str]:
-    """Sites without a facility, each with the requirement that its opening would break, or what is used up."""
+def _closed(
+    master: Master, solution: Solution, by_site: dict[int, float], binding: tuple[Binding, ...]
+) -> dict[int, str]:
+    """Sites without a facility, each with the requirement that opening it would break, if any."""
     reasons = {}
     for i, bus in enumerate(master.sites):
         if by_site[bus] > 0:
             continue
         opened = {**by_site, bus: float(master.lower[i])}
-        broken = sorted((row for row in master.rows if row.site == bus and row.value(opened) < 0),
-                        key=lambda row: row.value(opened))
+        broken = sorted(
+            (row for row in master.rows if row.site == bus and row.value(opened) < 0),
+            key=lambda row: row.value(opened),
+        )
         if broken:
             more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-            reasons[bus] = (f"{broken[0].label}: {-broken[0].value(opened):.4g} short at {opened[bus]:g} MW "
-                            f"beside the other sites{more}")
+            reasons[bus] = (
+                f"{broken[0].label}: {-broken[0].value(opened):.4g} short at {opened[bus]:g} MW "
+                f"beside the other sites{more}"
+            )
         elif master.upper[i] == 0:
             reasons[bus] = "its largest size is 0 MW"
         else:
@@ -135,9 +176,19 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         status = f"All {len(problem.year)} hours solve with every voltage within its limits."
     else:
         outside = int((room.min(axis=0) < -AC_TOLERANCE).sum())
-        status = (f"{outside} of {len(problem.year)} hours have a voltage outside its limits; the worst is "
-                  f"{size[row, k]:.5f} pu at bus {bus} in hour {hour}.")
-    return AcVerdict(inside and bool(solved.converged.all()), float(size.min()), float(size.max()), error, hour, bus, status)
+        status = (
+            f"{outside} of {len(problem.year)} hours have a voltage outside its limits; the worst is "
+            f"{size[row, k]:.5f} pu at bus {bus} in hour {hour}."
+        )
+    return AcVerdict(
+        inside and bool(solved.converged.all()),
+        float(size.min()),
+        float(size.max()),
+        error,
+        hour,
+        bus,
+        status,
+    )
 
 
 def base_case(hours: Hours, rating_scale: float) -> str:
@@ -166,25 +217,36 @@ def base_case(hours: Hours, rating_scale: float) -> str:
     assert worst is not None
     amount, at, cut = worst
     count = f"{'at least ' if len(todo) else ''}{len(short)} of {len(year)} hours"
-    first = ", ".join(str(h) for h in sorted(int(year.hours[t]) for t in short)[:5]) + (", ..." if len(short) > 5 else "")
+    first = ", ".join(str(h) for h in sorted(int(year.hours[t]) for t in short)[:5]) + (
+        ", ..." if len(short) > 5 else ""
+    )
     lines = network.branches
     if cut.lines:
-        where = ", ".join(f"{lines.label(b)} (rated {lines.rating[b]:.4g} MVA)"
-                          for b, _ in sorted(cut.lines, key=lambda item: -item[1])[:4])
+        where = ", ".join(
+            f"{lines.label(b)} (rated {lines.rating[b]:.4g} MVA)"
+            for b, _ in sorted(cut.lines, key=lambda item: -item[1])[:4]
+        )
         cause = f"branches are overloaded by {amount:.4g} MW whatever the dispatch: {where}"
         way = f"a larger rating_scale (now {rating_scale:g}), or more generation behind these branches"
     else:
-        cause = (f"units of {network.generators.p_max.sum():.5g} MW and {network.generators.p_min.sum():.5g} MW at least "
-                 f"cannot meet a net load of {demand[at]:.5g} MW ({amount:.4g} MW off)")
+        units = network.generators
+        cause = (
+            f"units that give {units.p_min.sum():.5g} to {units.p_max.sum():.5g} MW cannot meet a net load "
+            f"of {demand[at]:.5g} MW ({amount:.4g} MW off)"
+        )
         way = "more units, or other limits of theirs"
-    return (f"{network.name}: the base case has no dispatch in {count} (hours {first}) with nothing hosted.\n"
-            f"  Worst hour {int(year.hours[at])}: {cause}.\nWays out: {way}, or leave these hours out.")
+    return (
+        f"{network.name}: the base case has no dispatch in {count} (hours {first}) with nothing hosted.\n"
+        f"  Worst hour {int(year.hours[at])}: {cause}.\nWays out: {way}, or leave these hours out."
+    )
 
 
 def no_plan(rows: tuple[Row, ...]) -> str:
     """Say that rows which belong to no site exclude every plan."""
     general = [row.label for row in rows if row.site is None]
     listed = ", ".join(general[:6]) + (", ..." if len(general) > 6 else "")
-    return ("No capacities meet all requirement rows, not even with every site closed. Rows that hold for every plan: "
-            f"{listed or 'none'}. Ways out: give a row the site that it belongs to, so that the site can be closed, or "
-            "relax its limit.")
+    return (
+        "No capacities meet all requirement rows, not even with every site closed. Rows that hold for "
+        f"every plan: {listed or 'none'}. Ways out: give a row the site that it belongs to, so that the site "
+        "can be closed, or relax its limit."
+    )

@@ -17,6 +17,8 @@ Two forms are fitted to the same samples:
 
 Both are tightened by the largest overprediction on the fitting set (eqs. (surrogate_overprediction),
 (surrogate_tightening)). A run that failed has no margin: it is left out of every fit and counted in `n_excluded`.
+Where no run of a rating and period has a margin, or too few have one for a fit, the surrogate says nothing and the
+site counts as one that does not pass (`Surrogate.unknown`).
 """
 
 from __future__ import annotations
@@ -173,6 +175,7 @@ class Surrogate:
     slopes : per MW of data-centre load P_j = d_t H_j, in the order of the sites.
     rating_slope : per MVA of the site's own rating, 0 in method 'share'.
     tightening : how much the intercept was lowered.
+    unknown : (beta, period) pairs at which every run of the fitting set failed, or that have no fit.
     n_fit, n_excluded : points fitted; points of the fitting set left out because their run failed.
     n_mixed, n_sequences : fitting points whose event sequence is not the most common one; how many sequences.
     scores : on the validation set.
@@ -190,6 +193,7 @@ class Surrogate:
     slopes: Floats
     rating_slope: float
     tightening: float
+    unknown: tuple[tuple[float, str], ...]
     n_fit: int
     n_excluded: int
     n_mixed: int
@@ -232,21 +236,13 @@ def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
     Raises
     ------
     InputError
-        For an unknown method, and where so many runs failed that a fit has fewer points than coefficients.
+        For an unknown method.
     """
     if method not in ("paper", "share"):
         raise InputError(f"surrogate method {method!r}: must be 'paper' or 'share'.")
-    fits: list[Surrogate] = []
-    problems: list[str] = []
-    for chosen in _groups(data, by_beta=method == "share"):
-        for target in TARGETS:
-            found = (_fit_paper if method == "paper" else _fit_share)(data, chosen, target)
-            if isinstance(found, str):
-                problems.append(found)
-            else:
-                fits += found
-    raise_all(problems, f"surrogate '{method}'", InputError)
-    return fits
+    fit = _fit_paper if method == "paper" else _fit_share
+    return [surrogate for chosen in _groups(data, by_beta=method == "share") for target in TARGETS
+            for surrogate in fit(data, chosen, target)]
 
 
 def _groups(data: MarginData, by_beta: bool) -> Iterator[npt.NDArray[np.int64]]:
@@ -257,63 +253,64 @@ def _groups(data: MarginData, by_beta: bool) -> Iterator[npt.NDArray[np.int64]]:
     yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
-def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate] | str:
+def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate]:
     own = data.sites.index(int(data.site[chosen[0]]))
     load = data.hosting[chosen] * data.d[chosen, None]
     rating = data.beta[chosen] * data.hosting[chosen, own]
     x = np.column_stack([np.ones(len(chosen)), load, rating])
     m = data.margin(target, "paper")[chosen]
     fitted = data.fit[chosen] & data.ok[chosen]
-    if fitted.sum() < x.shape[1]:
-        return _too_few(data, chosen, target, int(fitted.sum()), x.shape[1])
-    k = least_squares(x[fitted], m[fitted], not_negative=[x.shape[1] - 1])
-    tightening = overprediction(x[fitted] @ k, m[fitted])
-    return [_surrogate("paper", data, chosen, target, m, x @ k - tightening, intercept=k[0] - tightening, slopes=k[1:-1],
-                       rating_slope=k[-1], tightening=tightening, period="", beta=0.0)]
+    k = _coefficients(x, m, fitted, not_negative=[x.shape[1] - 1])
+    return [_tightened("paper", data, chosen, target, m, x @ k, k[0], k[1:-1], k[-1], period="", beta=0.0)]
 
 
-def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate] | str:
+def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate]:
     load = data.hosting[chosen] * data.d[chosen, None]
     periods = sorted(set(data.period[chosen].tolist()))
-    in_period = np.stack([data.period[chosen] == period for period in periods], axis=1)
-    x = np.column_stack([in_period.astype(float), load])
-    m = data.margin(target, "share")[chosen]
     fitted = data.fit[chosen] & data.ok[chosen]
-    if fitted.sum() < x.shape[1] or not in_period[fitted].any(axis=0).all():
-        return _too_few(data, chosen, target, int(fitted.sum()), x.shape[1])
-    k = least_squares(x[fitted], m[fitted])
+    seen = [period for period in periods if (fitted & (data.period[chosen] == period)).any()]
+    x = np.column_stack([*[(data.period[chosen] == period).astype(float) for period in seen], load])
+    m = data.margin(target, "share")[chosen]
+    k = _coefficients(x, m, fitted)
     fits = []
-    for t, period in enumerate(periods):
-        here = in_period[:, t]
-        tightening = overprediction(x[fitted & here] @ k, m[fitted & here])
-        fits.append(_surrogate(
-            "share", data, chosen[here], target, m[here], x[here] @ k - tightening, intercept=k[t] - tightening,
-            slopes=k[len(periods):], rating_slope=0.0, tightening=tightening, period=period,
-            beta=float(data.beta[chosen[0]])))
+    for period in periods:
+        here = data.period[chosen] == period
+        intercept = k[seen.index(period)] if period in seen else -np.inf
+        predicted = x[here] @ k if period in seen else np.full(int(here.sum()), -np.inf)
+        fits.append(_tightened("share", data, chosen[here], target, m[here], predicted, intercept, k[len(seen):], 0.0,
+                               period=period, beta=float(data.beta[chosen[0]])))
     return fits
 
 
-def _surrogate(method: str, data: MarginData, chosen: npt.NDArray[np.int64], target: str, m: Floats, predicted: Floats,
-               **fitted: object) -> Surrogate:
-    """Put a fit together with the counts and scores of its points."""
+def _coefficients(x: Floats, m: Floats, fitted: Booleans, not_negative: Sequence[int] = ()) -> Floats:
+    """Least squares over the fitted points; an intercept of -inf (nothing passes) where they are too few."""
+    if fitted.sum() >= x.shape[1]:
+        return least_squares(x[fitted], m[fitted], not_negative)
+    k = np.zeros(x.shape[1])
+    k[0] = -np.inf
+    return k
+
+
+def _tightened(method: str, data: MarginData, chosen: npt.NDArray[np.int64], target: str, m: Floats, predicted: Floats,
+               intercept: float, slopes: Floats, rating_slope: float, period: str, beta: float) -> Surrogate:
+    """Tighten a fit on its fitting points and put it together with the counts and scores of its points."""
     ok, fit = data.ok[chosen], data.fit[chosen]
+    known = bool(np.isfinite(intercept))
+    tightening = overprediction(predicted[fit & ok], m[fit & ok]) if known else 0.0
     sequences = Counter(data.sequence[chosen[fit & ok]].tolist())
-    unseen = ~fit & ok
+    places = list(zip(data.beta[chosen].tolist(), data.period[chosen].tolist(), strict=True))
+    good = {place for place, usable in zip(places, fit & ok, strict=True) if usable}
+    unseen = ~fit & ok & known
     first = chosen[0]
     return Surrogate(
         method=method, site=int(data.site[first]), fault=str(data.fault[first]), mode=str(data.mode[first]),
-        target=target, n_fit=int((fit & ok).sum()), n_excluded=int((fit & ~ok).sum()),
-        n_mixed=sum(sequences.values()) - max(sequences.values()), n_sequences=len(sequences),
-        scores=score(predicted[unseen], m[unseen]),
-        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen]),
-        **fitted)  # type: ignore[arg-type]
-
-
-def _too_few(data: MarginData, chosen: npt.NDArray[np.int64], target: str, have: int, need: int) -> str:
-    k = chosen[0]
-    failed = int((data.fit[chosen] & ~data.ok[chosen]).sum())
-    return (f"{target} margin at bus {data.site[k]}, fault {data.fault[k]}, {data.mode[k]}: {have} good run(s) to fit "
-            f"{need} coefficients ({failed} run(s) failed). Way out: raise sampling.n, or see why runs fail in the store.")
+        target=target, period=period, beta=beta, intercept=float(intercept - tightening), slopes=slopes,
+        rating_slope=float(rating_slope), tightening=tightening,
+        unknown=tuple(sorted(set(places) - good if known else set(places))),
+        n_fit=int((fit & ok).sum()), n_excluded=int((fit & ~ok).sum()),
+        n_mixed=sum(sequences.values()) - max(sequences.values(), default=0), n_sequences=len(sequences),
+        scores=score(predicted[unseen] - tightening, m[unseen]),
+        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen] - tightening))
 
 
 # -- summary ------------------------------------------------------------------------------------------------------

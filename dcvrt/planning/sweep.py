@@ -65,6 +65,10 @@ def margin_rows(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d:
         if fit.site in closed:
             continue
         for period in (fit.period,) if fit.period else d:
+            if (beta, period) in fit.unknown:
+                closed[fit.site] = (f"no margin known: every run of the fitting set failed, or too few for a fit, at fault "
+                                    f"{fit.fault}, {period}, {fit.mode}, beta {beta:g}")
+                break
             a, lower = fit.at(beta, d[period], sites.index(fit.site))
             if float(np.minimum(a, 0.0) @ box) >= lower + NEVER_BINDS:
                 continue

@@ -60,7 +60,9 @@ class HostedFlow:
         self.change = hosting_directions(network, sites, pf)
         self.scheduled = injections(network, year.load, year.wind)
         self._all = np.arange(len(year))
-        self._latest: npt.NDArray[np.complex128] | None = None  # the next capacities are mostly near the last ones
+        self._latest: npt.NDArray[np.complex128] | None = (
+            None  # the next capacities are mostly near the last ones
+        )
 
     @cached_property
     def base(self) -> npt.NDArray[np.complex128]:
@@ -116,8 +118,10 @@ class VoltageScreen:
         for i in np.flatnonzero(outside.any(axis=1)):
             hours = np.flatnonzero(outside[i])
             k = hours[np.maximum(low - size[i, hours], size[i, hours] - high).argmax()]
-            lines.append(f"bus {network.bus[self.pq[i]]}: outside in {len(hours)} hours, worst {size[i, k]:.4f} pu "
-                         f"in hour {self.year.hours[k]}")
+            lines.append(
+                f"bus {network.bus[self.pq[i]]}: outside in {len(hours)} hours, worst {size[i, k]:.4f} pu "
+                f"in hour {self.year.hours[k]}"
+            )
         held = np.array(network.kind) != "pq"
         for i in np.flatnonzero(held & ((network.v_set < low) | (network.v_set > high))):
             lines.append(f"bus {network.bus[i]}: holds its set point {network.v_set[i]:.4f} pu")
@@ -125,9 +129,11 @@ class VoltageScreen:
             return
         shown = "\n  ".join(lines[:10]) + (f"\n  ... and {len(lines) - 10} more" if len(lines) > 10 else "")
         raise InfeasibleError(
-            f"{network.name}: with nothing hosted {len(lines)} bus(es) are outside the voltage limits {low:g}-{high:g} pu.\n"
-            f"  {shown}\nWays out: wider limits (voltage=...), other set points, or base_violations='hold', with which "
-            "these voltages must only not get worse.")
+            f"{network.name}: with nothing hosted {len(lines)} bus(es) are outside the voltage limits "
+            f"{low:g}-{high:g} pu.\n  {shown}\nWays out: wider limits (voltage=...), other set points, or "
+            "base_violations='hold', with which "
+            "these voltages must only not get worse."
+        )
 
     # -- rows ----------------------------------------------------------------------------------------------
 
@@ -138,7 +144,9 @@ class VoltageScreen:
     def tangent(self, bus: int, hour: int, side: int) -> Tangent:
         """The present linearisation of one voltage against one of its limits."""
         limit = (self.lower if side < 0 else self.upper)[bus, hour]
-        return Tangent(bus, hour, side, float(self.constant[bus, hour]), self.slope[bus, hour].copy(), float(limit))
+        return Tangent(
+            bus, hour, side, float(self.constant[bus, hour]), self.slope[bus, hour].copy(), float(limit)
+        )
 
     def violated(self, H: Floats, tolerance: float) -> list[Tangent]:
         """The most violated lower and the most violated upper limit."""

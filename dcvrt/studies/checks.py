@@ -82,6 +82,11 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
         sampling: SamplingSection | None = sections.get("sampling")
         if sampling is not None and sampling.h_max_mw is not None and len(sampling.h_max_mw) != len(grid.sites):
             problems.append(f"sampling.h_max_mw: {len(sampling.h_max_mw)} values for {len(grid.sites)} sites.")
+        if sampling is not None:
+            kept, needed = sampling.n - max(1, round(sampling.validation_share * sampling.n)), len(grid.sites) + 2
+            if kept < needed:
+                problems.append(f"sampling.n = {sampling.n}: leaves {kept} hosting vectors to fit a margin of {len(grid.sites)} sites, "
+                                f"{needed} are needed. Way out: raise sampling.n or lower sampling.validation_share.")
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
             problems += [f"criteria.{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."

@@ -13,8 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.errors import InputError
-from dcvrt.studies.config import FaultEntry, StudyFile, load
+from dcvrt.errors import DcvrtError, InputError
+from dcvrt.studies.config import FaultEntry, StudyFile
 from dcvrt.studies.store import Store
 from dcvrt.studies.style import mode_name
 
@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from dcvrt.dae import Dae
+    from dcvrt.grid.network import Network
 
 SAME_SHARE = 1e-3
 """Capacities that differ by less than this share of the plan without ride-through count as equal."""
 
-FILES = ("summary.json", "study.toml", "study.sqlite")
+FILES = ("summary.json", "study.sqlite")
 
 Row = Mapping[str, Any]
 
@@ -62,9 +63,9 @@ class Findings:
 
     @cached_property
     def study(self) -> StudyFile:
-        """`study.toml`."""
-        path = self.folder / "study.toml"
-        return load(path.read_text(encoding="utf-8"), str(path))
+        """The study as it was run: of a quick run the reduced one, which is not what `study.toml` says."""
+        known = self.provenance
+        return StudyFile.model_validate(known["study"] | {"study": known["study"]["study"] | {"name": known["study_name"]}})
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
@@ -143,6 +144,50 @@ class Findings:
         """Total of the plan without ride-through."""
         return float(self.summary["no_vrt"]["total_mw"])
 
+    @property
+    def no_vrt_by_site(self) -> dict[int, float]:
+        """Capacities of the plan without ride-through."""
+        return {int(bus): float(mw) for bus, mw in self.summary["no_vrt"]["by_site"].items()}
+
+    @cached_property
+    def network(self) -> Network:
+        """The network of the case, from where the run has found it.
+
+        Raises
+        ------
+        InputError
+            When the file of the case is no longer there.
+        """
+        from dcvrt.studies.checks import read_network
+
+        grid = self.study.grid
+        if len(self.tasks):  # relative paths of the study file were resolved when the tasks were written
+            request = json.loads(self.tasks.text.iloc[0])
+            grid = grid.model_copy(update={"case": request["case"], "dynamics": request["dynamics"]})
+        network, problems = read_network(grid, self.folder)
+        if network is None:
+            raise InputError("; ".join(problems))
+        return network
+
+    @cached_property
+    def map_problem(self) -> str | None:
+        """Why the network cannot be drawn, or None."""
+        try:
+            _ = self.network
+        except DcvrtError as error:
+            return str(error)
+        return None
+
+    @property
+    def periods(self) -> dict[str, dict[str, Any]]:
+        """Operating hours that faults are simulated in: {name: {hour, load_scale, wind, dc_factor}}."""
+        return dict(self.provenance["periods"])
+
+    @property
+    def wind_buses(self) -> list[int]:
+        """Buses with wind power."""
+        return sorted({int(bus) for period in self.periods.values() for bus in period["wind"]})
+
     def rows(self, mode: str | None = None, method: str | None = None) -> list[Row]:
         """Rows of the summary of a mode and a method, by rising beta."""
         chosen = [row for row in self.summary["rows"] if mode in (None, row["mode"]) and method in (None, row["method"])]
@@ -200,76 +245,107 @@ class Findings:
         return said
 
     def limits_of(self, row: Row) -> str:
-        """What keeps a row from hosting more: its dearest limits and its closed sites."""
-        parts = []
-        closed = self.closed(row)
-        if closed:
-            parts.append("; ".join(f"bus {bus} is closed ({reason.rstrip('.')})" for bus, reason in closed.items()))
-        binding = [binding_text(entry) for entry in row.get("binding") or []][:3]
-        if binding:
-            parts.append("the dearest limits are " + "; ".join(binding))
-        return (". ".join(part[0].upper() + part[1:] for part in parts) or "No limit is recorded for this row") + "."
+        """What keeps a row from hosting more: its closed sites and its dearest limits."""
+        parts = [f"bus {bus} is closed: {reason.rstrip('.')}" for bus, reason in closed(row).items()]
+        dearest = [binding_text(entry) for entry in binding(row)][:3]
+        if dearest:
+            parts.append("dearest limits: " + "; ".join(dearest))
+        text = ". ".join(part[0].upper() + part[1:] for part in parts)
+        return f"{text or 'No limit is recorded for this row'}."
 
-    def plan(self, row: Row) -> pd.Series[Any] | None:
+    def plan(self, row: Row) -> Row:
         """The row of `plans` that belongs to a row of the summary."""
         plans = self.plans
-        found = plans[(plans.method == row["method"]) & (plans["mode"] == row["mode"]) & (abs(plans.beta - row["beta"]) < 1e-9)]
-        return None if found.empty else found.iloc[0]
+        found = plans[(plans.method == row["method"]) & (plans["mode"] == row["mode"]) & (plans.beta == row["beta"])]
+        return dict(found.iloc[0])
 
-    def closed(self, row: Row) -> dict[str, str]:
-        """Sites without a facility in a row, each with the reason."""
-        plan = self.plan(row)
-        reasons = {} if plan is None or not plan.closed else {str(bus): str(why) for bus, why in dict(plan.closed).items()}
-        for bus, mw in row["by_site"].items():
-            if float(mw) <= 0.0:
-                reasons.setdefault(str(bus), "the programme gives it no capacity")
-        return reasons
+    def worst_case(self, mode: str | None = None) -> Case | None:
+        """The replayed run with the least margin, pu volts or share of import, whichever is less.
 
-    def worst_row(self) -> Row | None:
-        """The replayed row with the smallest loss or voltage margin, each margin against its own limit."""
-        replayed = [row for row in self.rows() if row["replay"].get("worst_voltage_margin_pu") is not None]
-        if not replayed:
+        Among the runs whose facility waveforms were kept: for every plan, those where its voltage margin and
+        where its loss margin is least.
+        """
+        replayed = self.margins[(self.margins.ok == 1) & (self.margins.h_mw > 0)
+                                & self.margins.hosting.isin(self.hostings.name[self.hostings.role == "plan"])]
+        if mode is not None:
+            replayed = replayed[replayed["mode"] == mode]
+        kept = self._kept_runs
+        keys = replayed[list(Case.KEYS)].itertuples(index=False, name=None)
+        replayed = replayed[[tuple(key) in kept for key in keys]]
+        if replayed.empty:
             return None
-        v_limit = self.study.criteria.v_it_min_pu
+        least = replayed[["v_margin_pu", "loss_margin_share"]].min(axis=1)
+        row = replayed.loc[least.idxmin()]
+        return Case(str(row.hosting), str(row.period), str(row.fault), int(row.site), str(row["mode"]), float(row.beta),
+                    float(row.h_mw), float(row.v_margin_pu), float(row.loss_margin_share), str(row.sequence))
 
-        def margin(row: Row) -> float:
-            total = max(float(row["total_mw"]), 1.0)
-            loss = row["replay"].get("worst_loss_margin_mw")
-            return min(row["replay"]["worst_voltage_margin_pu"] / v_limit, 0.0 if loss is None else loss / total)
+    @cached_property
+    def _kept_runs(self) -> set[tuple[Any, ...]]:
+        """Runs whose facility waveforms are in the store."""
+        return {tuple(key[name] for name in Case.KEYS) for mode in self.modes for key, _ in self.waveforms(mode=mode)}
 
-        return min(replayed, key=margin)
+
+@dataclass(frozen=True)
+class Case:
+    """One checked facility run: where it was and what came out."""
+
+    KEYS = ("hosting", "period", "fault", "site", "mode", "beta")
+
+    hosting: str
+    period: str
+    fault: str
+    site: int
+    mode: str
+    beta: float
+    h_mw: float
+    v_margin_pu: float
+    loss_margin_share: float
+    sequence: str
 
 
 def verdict(row: Row) -> str:
-    """Outcome of the replay of a row: passed, failed or not replayed.
+    """Outcome of the replay of a row: passed, failed, or nothing hosted and so nothing replayed.
 
-    >>> verdict({"replay": {"passed": None}})
-    'not replayed'
+    >>> verdict({"total_mw": 0.0, "replay": {"passed": True}}), verdict({"total_mw": 9.0, "replay": {"passed": False}})
+    ('nothing hosted', 'failed')
     """
-    passed = (row.get("replay") or {}).get("passed")
-    return "not replayed" if passed is None else "passed" if passed else "failed"
+    if not row["total_mw"] > 0:
+        return "nothing hosted"
+    return "passed" if row["replay"]["passed"] else "failed"
 
 
 def ac_verdict(row: Row) -> str:
     """Outcome of the AC power flow of a row."""
-    passed = (row.get("ac") or {}).get("passed")
-    return "not checked" if passed is None else "passed" if passed else "failed"
+    return "passed" if row["ac"]["passed"] else "failed"
 
 
-def binding_text(entry: Any) -> str:
+def closed(row: Row) -> dict[str, str]:
+    """Sites without a facility in a row, each with the reason."""
+    return {str(entry["bus"]): str(entry["label"]) for entry in row["binding"] if entry["kind"] == "closed"}
+
+
+def carried(row: Row) -> str:
+    """Where a plan comes from that was found at a smaller rating; empty for others."""
+    return next((str(entry["label"]) for entry in row["binding"] if entry["kind"] == "carried"), "")
+
+
+def binding(row: Row) -> list[Row]:
+    """Limits that bind in a row, dearest first."""
+    return [entry for entry in row["binding"] if entry["kind"] not in ("closed", "carried")]
+
+
+def binding_text(entry: Row) -> str:
     """A limit as a phrase.
 
     >>> binding_text({"kind": "line", "label": "80-99", "hour": 12, "price": 0.52, "unit": "MW/MVA"})
     'line 80-99 in hour 12 (0.52 MW/MVA)'
+    >>> binding_text({"kind": "row", "label": "loss at bus 75", "hour": None, "price": 3.0, "unit": "MW"})
+    'loss at bus 75 (3 MW)'
     """
-    if not isinstance(entry, Mapping):
-        return str(entry)
-    text = f"{entry.get('kind', '')} {entry.get('label', '')}".strip()
+    text = str(entry["label"]) if entry["kind"] == "row" else f"{entry['kind']} {entry['label']}"
     if entry.get("hour") is not None:
         text += f" in hour {entry['hour']}"
-    if entry.get("price"):
-        text += f" ({entry['price']:.3g} {entry.get('unit') or 'MW'})".replace(" )", ")")
-    return text
+    return f"{text} ({entry['price']:.3g} {entry['unit']})" if entry.get("price") else text
 
 
 def by_site(row: Row, sites: Sequence[int]) -> list[float]:

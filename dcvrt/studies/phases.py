@@ -181,7 +181,7 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
             scores = {name: value for name, value in asdict(fit.scores).items() if name != "n"}
             store.put("surrogates", [key | scores | {
                 "intercept": fit.intercept, "slopes": dict(zip(map(str, setting.sites), fit.slopes.tolist(), strict=True)),
-                "rating_slope": fit.rating_slope, "tightening": fit.tightening, "n_fit": fit.n_fit,
+                "rating_slope": fit.rating_slope, "tightening": fit.tightening, "unknown": [list(place) for place in fit.unknown], "n_fit": fit.n_fit,
                 "n_validation": fit.scores.n, "n_excluded": fit.n_excluded, "n_mixed": fit.n_mixed,
                 "n_sequences": fit.n_sequences}])
             names, margins, predicted = fit.validation
@@ -199,7 +199,7 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
     """Solve the hosting programme for every method, mode and rating, and check each plan by AC power flow."""
     file = setting.file
     digest = hashlib.sha256(json.dumps([[fit.method, fit.mode, fit.site, fit.fault, fit.target, fit.period, fit.beta,
-                                         fit.intercept, *fit.slopes.tolist(), fit.rating_slope] for fit in fits])
+                                         fit.intercept, *fit.slopes.tolist(), fit.rating_slope, fit.unknown] for fit in fits])
                             .encode()).hexdigest()
     if store.provenance().get("plans_from") == digest:
         return

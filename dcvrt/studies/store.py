@@ -19,8 +19,8 @@ in which the work was done):
                of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The first
                signal is always t_s.
 `surrogates`   one fitted margin: method, mode, site, fault, target ('voltage' or 'loss'), period ('' where pooled),
-               beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening; n_fit,
-               n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is not the most
+               beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening; unknown ([beta, period] at which no run
+               has a margin: the site counts as not passing there); n_fit, n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is not the most
                common one), n_sequences; mae, rmse, worst_over, worst_under, violation_rate, on the validation set.
 `predictions`  validation points of every surrogate, numbered: method, mode, site, fault, target, period, beta,
                hosting, point, margin, predicted.
@@ -67,7 +67,7 @@ TABLES = {
                  "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "surrogates": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
                   "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, intercept REAL, slopes TEXT NOT NULL, "
-                  "rating_slope REAL, tightening REAL, n_fit INTEGER, n_validation INTEGER, n_excluded INTEGER, "
+                  "rating_slope REAL, tightening REAL, unknown TEXT NOT NULL, n_fit INTEGER, n_validation INTEGER, n_excluded INTEGER, "
                   "n_mixed INTEGER, n_sequences INTEGER, mae REAL, rmse REAL, worst_over REAL, worst_under REAL, "
                   "violation_rate REAL, PRIMARY KEY (method, mode, site, fault, target, period, beta)",
     "predictions": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
@@ -80,7 +80,7 @@ TABLES = {
              "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
              "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
 }
-JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "diagnostics", "worst"}
+JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "unknown", "diagnostics", "worst"}
 
 
 class Store:

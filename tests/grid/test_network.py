@@ -100,7 +100,9 @@ def test_ptdf_reproduces_an_angle_solution(ieee118: Network) -> None:
     keep = np.delete(np.arange(118), ieee118.slack)
     theta = np.zeros(118)
     theta[keep] = np.linalg.solve(laplacian[np.ix_(keep, keep)], injection[keep])
-    assert ieee118.flows(injection) == pytest.approx(ieee118.susceptance * (ieee118.incidence @ theta), abs=1e-8)
+    assert ieee118.flows(injection) == pytest.approx(
+        ieee118.susceptance * (ieee118.incidence @ theta), abs=1e-8
+    )
     assert not ieee118.ptdf()[:, ieee118.slack].any()
 
 
@@ -118,29 +120,42 @@ def test_unknown_bus_is_named_with_the_nearest(triangle: Network) -> None:
 def test_all_unknown_buses_are_named_at_once(triangle: Network) -> None:
     with pytest.raises(InputError) as error:
         triangle.indices([10, 300, 7])
-    assert str(error.value) == ("triangle: 2 problems\n  no bus 300. Did you mean '30'? Known: 10, 20, 30.\n"
-                                "  no bus 7. Known: 10, 20, 30.")
+    assert str(error.value) == (
+        "triangle: 2 problems\n  no bus 300. Did you mean '30'? Known: 10, 20, 30.\n"
+        "  no bus 7. Known: 10, 20, 30."
+    )
 
 
 def test_faults_of_a_case_are_listed_together(triangle: Network) -> None:
     lines = triangle.branches
     with pytest.raises(InputError) as error:
-        replace(triangle, kind=("pv", "pv", "pq"), p_load=np.array([0.0, np.nan, 90.0]),
-                branches=replace(lines, to_bus=np.array([20, 30, 99]), x=np.array([0.0, 0.2, 0.1])))
+        replace(
+            triangle,
+            kind=("pv", "pv", "pq"),
+            p_load=np.array([0.0, np.nan, 90.0]),
+            branches=replace(lines, to_bus=np.array([20, 30, 99]), x=np.array([0.0, 0.2, 0.1])),
+        )
     assert str(error.value) == (
         "triangle: 4 problems\n"
         "  needs exactly one slack bus (type 3), found none.\n"
         "  bus column 'p_load' has NaN in row 1.\n"
         "  branch 10-20 has zero reactance. Way out: merge its buses or give it 1e-4 pu.\n"
-        "  branch 10-99 ends at bus 99, which is not in the bus table.")
+        "  branch 10-99 ends at bus 99, which is not in the bus table."
+    )
 
 
 def test_island_is_refused(triangle: Network) -> None:
     with pytest.raises(InputError) as error:
-        replace(triangle, branches=replace(triangle.branches, from_bus=np.array([10, 10, 10]),
-                                           to_bus=np.array([20, 20, 20])))
-    assert str(error.value) == ("triangle: 1 bus(es) have no path to the slack bus: 30. "
-                                "Way out: close a branch to them or leave them out.")
+        replace(
+            triangle,
+            branches=replace(
+                triangle.branches, from_bus=np.array([10, 10, 10]), to_bus=np.array([20, 20, 20])
+            ),
+        )
+    assert str(error.value) == (
+        "triangle: 1 bus(es) have no path to the slack bus: 30. "
+        "Way out: close a branch to them or leave them out."
+    )
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
@@ -152,11 +167,14 @@ def test_missing_file_is_refused(tmp_path: Path) -> None:
 
 def test_unreadable_tables_are_listed_with_their_lines(tmp_path: Path) -> None:
     path = tmp_path / "bad.m"
-    path.write_text("mpc.version = '2';\nmpc.baseMVA = 100;\nmpc.bus = [\n 1 3 x 0;\n];\nmpc.gen = [\n 1 2 3;\n];\n")
+    path.write_text(
+        "mpc.version = '2';\nmpc.baseMVA = 100;\nmpc.bus = [\n 1 3 x 0;\n];\nmpc.gen = [\n 1 2 3;\n];\n"
+    )
     with pytest.raises(InputError) as error:
         Network.from_matpower(path)
     assert str(error.value) == (
         f"{path}: 3 problems\n"
         "  line 4: mpc.bus has a word that is not a number: '1 3 x 0'.\n"
         "  line 7: mpc.gen has 3 columns, expected at least 10.\n"
-        "  has no table mpc.branch.")
+        "  has no table mpc.branch."
+    )

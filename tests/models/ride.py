@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -30,8 +31,18 @@ class System:
         self.guards = ca.Function(
             "guards", args, [ca.vertcat(*[r.guard for r in rows]) if rows else ca.SX(0, 1)]
         )
-        helds = ca.Function("held", [dae.p], [ca.vertcat(*[r.held for r in rows]) if rows else ca.SX(0, 1)])
-        self.held = np.array(helds(self.p)).ravel()
+        self._held = ca.Function(
+            "held", [dae.p], [ca.vertcat(*[r.held for r in rows]) if rows else ca.SX(0, 1)]
+        )
+
+    def set(self, **changes: float) -> System:
+        """Other parameter values, from the defaults."""
+        self.p = self.dae.parameter_values(**changes)
+        return self
+
+    @property
+    def held(self) -> np.ndarray:
+        return np.array(self._held(self.p)).ravel()
 
     def flags(self, mode: str) -> np.ndarray:
         return self.automaton.flags[self.automaton.mode_number(mode)] if self.automaton else np.zeros(0)
@@ -91,10 +102,10 @@ def ride(
 
     x = system.equilibrium(u(0.0))
     mode, entered = system.automaton.start, 0.0
-    since = np.full(len(system.rows), np.nan)
+    since, held = np.full(len(system.rows), np.nan), system.held
     ts, xs, ys, modes = [0.0], [x], [system.out(x, u(0.0), mode)], [(0.0, mode)]
     grid = np.unique(np.concatenate([np.arange(0.0, until + step / 2, step), np.array(jumps)]))
-    for a, b in zip(grid[:-1], grid[1:], strict=True):
+    for a, b in pairwise(grid):
         inside = lambda t, a=a, b=b: u(a + (b - a) * np.clip((t - a) / (b - a), 1e-9, 1 - 1e-9))  # noqa: E731
         for _ in range(20):
             g = np.array(system.guards(x, inside(a), system.p, system.flags(mode), [a - entered])).ravel()
@@ -105,21 +116,15 @@ def ride(
                     continue
                 if np.isnan(since[k]):
                     since[k] = a
-                if due is None and a - max(since[k], entered) >= system.held[k] - 1e-12:
+                if due is None and a - max(since[k], entered) >= held[k] - 1e-12:
                     due = row
             if due is None:
                 break
             mode, entered = due.target, a
             since[:] = np.nan
             modes.append((a, mode))
-        done = solve_ivp(
-            lambda t, x: system.rate(x, inside(t), mode, t - entered),
-            (a, b),
-            x,
-            method="LSODA",
-            rtol=rtol,
-            atol=1e-9,
-        )
+        rhs = lambda t, x, mode=mode, start=entered, u=inside: system.rate(x, u(t), mode, t - start)  # noqa: E731
+        done = solve_ivp(rhs, (a, b), x, method="LSODA", rtol=rtol, atol=1e-9)
         assert done.success, done.message
         x = done.y[:, -1]
         ts.append(b)

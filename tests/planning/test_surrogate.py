@@ -165,16 +165,23 @@ def test_mixed_event_sequences_are_counted() -> None:
     assert (f.n_mixed, f.n_sequences) == (other, 2)
 
 
-def test_too_few_good_runs_name_every_fit() -> None:
+@pytest.mark.parametrize("method", ["paper", "share"])
+def test_too_few_good_runs_mean_that_nothing_passes(method: str) -> None:
     data = runs(affine, static_loss, betas=(1.2,), failed=lambda H, beta: H[0] > 0.31 or H[1] > 1.6)
     assert (data.ok & (data.site == 21)).sum() == 2  # one hosting vector in two periods
-    failed = int((~data.ok & data.fit & (data.site == 21)).sum())
-    with pytest.raises(InputError) as caught:
-        fit_surrogates(data, "share")
-    assert str(caught.value) == "surrogate 'share': 4 problems\n" + "\n".join(
-        f"  {target} margin at bus {bus}, fault bus 32, gfl: 2 good run(s) to fit 4 coefficients ({failed} run(s) failed). "
-        "Way out: raise sampling.n, or see why runs fail in the store."
-        for bus in SITES for target in ("voltage", "loss"))
+    fits = fit_surrogates(data, method)
+    assert {(f.intercept, f.scores.n) for f in fits} == {(-np.inf, 0)}
+    assert {place for f in fits for place in f.unknown} == {(1.2, "peak"), (1.2, "light")}
+
+
+def test_a_rating_without_any_good_run_is_unknown_and_the_others_are_fitted() -> None:
+    data = runs(affine, static_loss, failed=lambda H, beta: beta == 1.0)
+    for f in fit_surrogates(data, "paper"):
+        assert f.unknown == ((1.0, "light"), (1.0, "peak"))
+        assert f.target == "loss" or f.slopes == pytest.approx([-3e-4, 1e-4], abs=1e-12)
+    for f in fit_surrogates(data, "share"):
+        assert f.unknown == (((1.0, f.period),) if f.beta == 1.0 else ())
+        assert np.isfinite(f.intercept) == (f.beta != 1.0)
 
 
 def test_a_run_marked_ok_without_a_margin_is_refused() -> None:

@@ -17,9 +17,9 @@ D = {"peak": 1.0, "light": 0.9}
 
 
 def surrogate(site: int, intercept: float, slopes=(0.0, 0.0, 0.0, 0.0), rating=0.0, method="paper", beta=0.0,
-              mode="gfl", period="", target="loss") -> Surrogate:
+              mode="gfl", period="", target="loss", unknown=()) -> Surrogate:
     return Surrogate(method, site, "bus 32, 100 ms", mode, target, period, beta, intercept, np.array(slopes), rating,
-                     0.0, 10, 0, 0, 1, Scores(0, *[float("nan")] * 5), NOTHING)
+                     0.0, unknown, 10, 0, 0, 1, Scores(0, *[float("nan")] * 5), NOTHING)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,14 @@ def test_rows_that_hold_everywhere_are_left_out_and_hopeless_ones_close_their_si
     rows, closed = margin_rows(fits, SITES, 1.0, D, np.full(4, 100.0))
     assert closed == {75: "no capacity in the sampled box passes: loss at bus 75, fault bus 32, 100 ms, peak, gfl, beta 1"}
     assert {row.site for row in rows} == {106}
+
+
+def test_a_site_whose_margin_is_unknown_is_closed() -> None:
+    fits = [surrogate(75, 1.0, unknown=((1.0, "light"),))]
+    assert margin_rows(fits, SITES, 1.2, D, np.full(4, 100.0)) == ([], {})
+    rows, closed = margin_rows(fits, SITES, 1.0, D, np.full(4, 100.0))
+    assert not rows and closed == {75: "no margin known: every run of the fitting set failed, or too few for a fit, at fault "
+                                       "bus 32, 100 ms, light, gfl, beta 1"}
 
 
 def test_a_site_without_a_passing_capacity_is_closed_and_the_others_stay(problem: HostingProblem) -> None:

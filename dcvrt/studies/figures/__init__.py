@@ -1,0 +1,79 @@
+"""The figures of a study, drawn from its folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.style import mode_name, save, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TEST_BETA = 1.15
+"""Rating of the facility in the figure of the internal response; a study that has it in its list, or the nearest."""
+
+
+def draw_all(folder: Path) -> list[Path]:
+    """Draw every figure of a finished study as SVG and PNG into its folder `figures`.
+
+    Parameters
+    ----------
+    folder : study folder.
+
+    Returns
+    -------
+    list of Path
+        What was written. Figures of earlier runs under other names are removed.
+
+    Raises
+    ------
+    InputError
+        When the folder holds no finished study.
+    """
+    findings = Findings(Path(folder))
+    into = Path(folder) / "figures"
+    written: list[Path] = []
+    with styled():
+        for name, figure in _figures(findings):
+            written += save(figure, into, name)
+    for path in into.glob("*.*"):
+        if path.suffix in (".svg", ".png") and path not in written:
+            path.unlink()
+    return written
+
+
+def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
+    from dcvrt.studies.figures import capacity, faults, framework, network_map, supervisor, validation, worst
+
+    yield "framework", framework.draw()
+    yield "capacity", capacity.draw_totals(findings)
+    yield "allocation", capacity.draw_allocation(findings)
+    yield "validation", validation.draw(findings)
+    yield "retained_voltage", faults.draw(findings)
+    if findings.map_problem is None:
+        yield "network_map", network_map.draw(findings.network, findings.sites, findings.wind_buses,
+                                              [fault.bus for fault in findings.faults], findings.no_vrt_by_site)
+    for mode in findings.modes:
+        case = findings.worst_case(mode)
+        if case is not None:
+            yield f"worst_case_{mode}", worst.draw(findings, case)
+    for mode in findings.modes:
+        yield f"internal_response_{mode}", _internal_response(findings, mode)
+    yield "supervisor", supervisor.draw(findings.facility(findings.modes[0]))
+
+
+def _internal_response(findings: Findings, mode: str) -> Figure:
+    from dcvrt.integrators import Simulator
+    from dcvrt.studies.figures import ride
+    from dcvrt.waveform import Waveform
+
+    waveform = Waveform.ercot_style()
+    dae = findings.facility(mode)
+    beta = min(findings.study.facility.beta, key=lambda b: abs(b - TEST_BETA))
+    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf, **findings.parameters(mode))
+    title = f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; not ERCOT's official waveform)"
+    return ride.draw(ride.signals_of(run, waveform.at(run.t)), dae.automata[0].modes, title,
+                     findings.study.criteria.v_it_min_pu)

@@ -40,12 +40,12 @@ def draw_totals(findings: Findings) -> Figure:
             beta, total = [row["beta"] for row in rows], [row["total_mw"] for row in rows]
             axes.plot(beta, total, color=mode_colour(mode, modes), linestyle=METHOD_LINES[k % len(METHOD_LINES)],
                       marker=mode_marker(mode, modes), markerfacecolor=mode_colour(mode, modes) if k == 0 else "white",
-                      label=METHOD_TEXT.get(method, method), clip_on=False, zorder=3 + k)
+                      label=METHOD_TEXT.get(method, method), zorder=3 + k)
             cross_failed(axes, rows, [row["total_mw"] for row in rows])
         axes.set_xlabel("converter rating over capacity, β")
         panel(axes, letter, mode_name(mode))
     panels[0].set_ylabel("hosted capacity (MW)")
-    panels[0].set_ylim(0, 1.12 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]))
+    panels[0].set_ylim(-0.02 * findings.no_vrt_mw, 1.12 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]))
     _legend(figure, panels[0], any(verdict(row) == "failed" for row in findings.rows()))
     return figure
 
@@ -71,10 +71,12 @@ def draw_allocation(findings: Findings) -> Figure:
 
 
 def cross_failed(axes: Axes, rows: list[Row], heights: list[float]) -> None:
-    """Cross out the points of rows that failed the replay, or were never replayed."""
-    failed = [k for k, row in enumerate(rows) if verdict(row) != "passed"]
+    """Cross out the points of rows that failed the replay."""
+    failed = [k for k, row in enumerate(rows) if verdict(row) == "failed"]
+    if not failed:
+        return
     axes.plot([rows[k]["beta"] for k in failed], [heights[k] for k in failed], linestyle="none", marker="x", markersize=8,
-              markeredgewidth=1.7, color=FAILED, zorder=9, clip_on=False)
+              markeredgewidth=1.7, color=FAILED, zorder=9)
 
 
 def _stack(axes: Axes, findings: Findings, mode: str, method: str) -> None:
@@ -89,7 +91,7 @@ def _stack(axes: Axes, findings: Findings, mode: str, method: str) -> None:
         floor = [low + high for low, high in zip(floor, heights, strict=True)]
     axes.axhline(findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)), label="without ride-through")
     cross_failed(axes, rows, [top + 0.03 * findings.no_vrt_mw for top in floor])
-    if any(verdict(row) != "passed" for row in findings.rows()):
+    if any(verdict(row) == "failed" for row in findings.rows()):
         axes.plot([], [], linestyle="none", marker="x", markersize=7, markeredgewidth=1.7, color=FAILED, label="failed the replay")
     axes.grid(axis="x", visible=False)
 

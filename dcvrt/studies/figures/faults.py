@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dcvrt.studies.config import FaultEntry
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.style import GREY, INK, MARKERS, PAGE, new_figure, site_colour
 
@@ -18,6 +19,11 @@ def retained(margins: pd.DataFrame) -> pd.DataFrame:
     """Lowest POI voltage by fault and site: smallest, middle and largest over hosting vectors and periods."""
     once = margins.dropna(subset=["v_poi_min_pu"]).drop_duplicates(["hosting", "period", "fault", "site"])
     return once.groupby(["fault", "site"]).v_poi_min_pu.agg(["min", "median", "max"]).reset_index()
+
+
+def fault_name(fault: FaultEntry) -> str:
+    """What the store calls a fault of the study file."""
+    return f"bus {fault.bus}, {fault.t_clear_ms:g} ms"
 
 
 def rating_line(beta: float, loss_share: float) -> float:
@@ -34,7 +40,8 @@ def rating_line(beta: float, loss_share: float) -> float:
 def draw(findings: Findings) -> Figure:
     """One line a fault, one marker a site; the bar spans hosting vectors and periods."""
     table, sites = retained(findings.margins), findings.sites
-    faults = list(dict.fromkeys(table.fault))
+    present = set(table.fault)
+    faults = [name for name in map(fault_name, findings.faults) if name in present]
     figure = new_figure(PAGE, 0.95 + 0.36 * max(len(faults), 1))
     axes = figure.add_subplot()
     spread = np.linspace(0.27, -0.27, len(sites)) if len(sites) > 1 else np.zeros(1)
@@ -58,5 +65,7 @@ def draw(findings: Findings) -> Figure:
     axes.set_xlabel("lowest POI voltage during the fault (pu)")
     axes.set_ylabel("fault")
     axes.grid(axis="y", visible=False)
-    figure.legend(loc="outside lower center", ncols=len(sites) or 1)
+    axes.plot([], [], color=GREY, linewidth=0.7, linestyle=(0, (3, 2)),
+              label="static limit of the load loss for a rating β")
+    figure.legend(loc="outside lower center", ncols=len(sites) + 1)
     return figure

@@ -1,0 +1,216 @@
+"""The command line. What is heavy is imported inside the commands, so that `dcvrt --help` answers at once.
+
+Exit codes: 0 done; 1 internal error; 2 bad input; 3 the question has no answer (infeasible); 4 incomplete: something
+was set aside or did not reach its end.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dcvrt import __version__
+from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationError
+
+OK, INTERNAL, BAD_INPUT, INFEASIBLE, INCOMPLETE = range(5)
+
+app = typer.Typer(name="dcvrt", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                  help="How much data-centre load a grid can host when every site must ride through the grid's faults.")
+study = typer.Typer(no_args_is_help=True, help="A study: one TOML file in, one folder of tables, figures and report out.")
+facility = typer.Typer(no_args_is_help=True, help="The facility variants: what they are made of.")
+app.add_typer(study, name="study")
+app.add_typer(facility, name="facility")
+
+TEST_WAVEFORMS = ("ercot-style", "sag-30", "sag-50", "sag-70", "sag-85")
+"""Waveforms that can be named instead of a file; sag-NN leaves NN % for 150 ms."""
+
+
+@app.callback(invoke_without_command=True)
+def _root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False) -> None:
+    if show_version:
+        print(f"dcvrt {__version__}")
+        raise typer.Exit(OK)
+
+
+# -- study --------------------------------------------------------------------------------------------------------
+
+
+@study.command("run")
+def study_run(
+    file: Annotated[Path | None, typer.Argument(help="Study file; without one, the IEEE-118 study.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results; the same folder again resumes.")] = None,
+    workers: Annotated[int, typer.Option(help="Worker processes on this machine.")] = 2,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a running dask scheduler, instead of own workers.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer samples, periods and ratings: minutes instead of more.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Do once more what was set aside.")] = False,
+) -> None:
+    """Run a study, or go on with an interrupted one."""
+    from dcvrt.studies.progress import Reporter
+    from dcvrt.studies.study import Study
+
+    try:
+        result = Study.load(file).run(out, workers, scheduler, quick, retry, Reporter())
+    except KeyboardInterrupt:
+        _complain("Interrupted. The same command goes on where it stopped.")
+        raise typer.Exit(INCOMPLETE) from None
+    _show(result)
+
+
+@study.command("new")
+def study_new(file: Annotated[Path, typer.Argument(help="File to write; must not exist.")]) -> None:
+    """Write a commented study file to edit."""
+    from dcvrt.studies.config import template
+
+    if file.exists():
+        raise InputError(f"{file} exists already. Way out: another name; nothing was written.")
+    if not file.parent.is_dir():
+        raise InputError(f"{file.parent}: no such folder. Way out: make it first.")
+    file.write_text(template(), encoding="utf-8")
+    print(f"{file}: edit it, then 'dcvrt study check {file}' and 'dcvrt study run {file}'")
+
+
+@study.command("check")
+def study_check(file: Annotated[Path, typer.Argument(help="Study file.")]) -> None:
+    """Report every mistake in a study file at once; runs nothing."""
+    from dcvrt.studies.study import Study
+
+    s = Study.load(file).file
+    print(f"{file}: in order: {len(s.grid.sites)} sites, {len(s.fault)} faults, {len(s.period)} periods, "
+          f"{len(s.facility.modes)} modes, {len(s.facility.beta)} ratings, {s.sampling.n} samples")
+
+
+@study.command("report")
+def study_report(folder: Annotated[Path, typer.Argument(help="Folder that 'dcvrt study run' has made.")]) -> None:
+    """Write tables, figures and report again from the store of a finished study."""
+    from dcvrt.studies.study import Result
+
+    result = Result.of(folder)
+    for path in result.report():
+        print(path)
+    if not result.complete:
+        raise typer.Exit(INCOMPLETE)
+
+
+@study.command("schema")
+def study_schema() -> None:
+    """Print the JSON Schema of the study file, for editors."""
+    from dcvrt.studies.config import schema
+
+    print(schema())
+
+
+def _show(result: object) -> None:
+    """Print the table of plans and where the rest is; say what is missing and end with code 4 if anything is."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from dcvrt.studies.study import Result
+
+    assert isinstance(result, Result)
+    frame = result.table()
+    sites = [column for column in frame if str(column).startswith("bus_")]
+    shown = Table("method", "mode", "beta", "MW", *[f"bus {c[4:-3]}" for c in sites], "replay", "voltage margin", "loss margin",
+                  "AC")
+    for row in frame.to_dict("records"):
+        verdict = {"failed": "[red]failed[/]", "passed": "[green]passed[/]"}.get(row["replay"], row["replay"])
+        shown.add_row(row["method"], row["mode"], _number(row["beta"], "g"), _number(row["total_mw"], ".2f"),
+                      *[_number(row[c], ".2f") for c in sites], verdict, _number(row["worst_voltage_margin_pu"], ".4f"),
+                      _number(row["worst_loss_margin_mw"], ".2f"), row["ac"])
+    console = Console()
+    if not sys.stdout.isatty():
+        console.width = 120
+    console.print(shown)
+    counts = result.summary["simulations"]
+    console.print(f"{counts['grid']} fault simulations, {counts['facility']} facility runs, {counts['failed']} failed, "
+                  f"{counts['quarantined']} task(s) set aside; report: {result.folder / 'report.html'}", highlight=False)
+    if not result.complete:
+        for line in result.lost:
+            print(line, file=sys.stderr)
+        print("The study is incomplete: plans with missing runs count as failed. Way out: look at the messages above, "
+              "then run again with --retry.", file=sys.stderr)
+        raise typer.Exit(INCOMPLETE)
+
+
+def _number(value: object, form: str) -> str:
+    return "" if value is None or value != value else format(value, form)
+
+
+# -- one facility -------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def ride(
+    variant: Annotated[str, typer.Argument(help="Facility variant; 'dcvrt facility list' shows them.")],
+    waveform: Annotated[str, typer.Option(help=f"CSV file with columns t and v, or one of {', '.join(TEST_WAVEFORMS)}.")],
+    beta: Annotated[float, typer.Option(help="Converter rating over hosted capacity.")] = 1.15,
+    out: Annotated[Path | None, typer.Option(help="Folder for the signals (CSV) and their picture (SVG).")] = None,
+) -> None:
+    """Run one facility on one waveform: margins, events, signals."""
+    from dcvrt.studies.single import ride as run_one
+
+    text, complete = run_one(variant, waveform, beta, out, TEST_WAVEFORMS)
+    print(text)
+    if not complete:
+        raise typer.Exit(INCOMPLETE)
+
+
+@facility.command("list")
+def facility_list() -> None:
+    """List the shipped variants."""
+    from dcvrt import facility as variants
+
+    for name in variants.names():
+        print(f"{name:20} {variants.get(name).doc}")
+
+
+@facility.command("sheet")
+def facility_sheet(variant: Annotated[str, typer.Argument(help="Facility variant.")]) -> None:
+    """Print equations, parameters, ports and modes of a variant (Markdown)."""
+    from dcvrt import facility as variants
+
+    print(variants.get(variant).sheet())
+
+
+# -- the machine --------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def doctor() -> None:
+    """Say what is installed, where caches are, what is missing and how to get it."""
+    from dcvrt.studies.doctor import examine
+
+    text, healthy = examine()
+    print(text)
+    if not healthy:
+        raise typer.Exit(INCOMPLETE)
+
+
+# -- entry --------------------------------------------------------------------------------------------------------
+
+
+def code_of(error: DcvrtError) -> int:
+    """Exit code of an error."""
+    if isinstance(error, InfeasibleError):
+        return INFEASIBLE
+    return INCOMPLETE if isinstance(error, SimulationError) else BAD_INPUT
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; errors of dcvrt are one message without a traceback."""
+    try:
+        app(sys.argv[1:] if arguments is None else arguments)
+    except DcvrtError as error:
+        _complain(str(error))
+        raise SystemExit(code_of(error)) from None
+
+
+def _complain(text: str) -> None:
+    red, plain = ("\033[31m", "\033[0m") if sys.stderr.isatty() else ("", "")
+    print(f"{red}{text}{plain}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+"""A case at one hosting vector and period: power flow, initialisation, and fault after fault from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dcvrt.errors import InputError, SimulationError
+from dcvrt.grid import redispatch
+from dcvrt.grid.andes import Said, quiet
+from dcvrt.grid.faults import BusFault
+from dcvrt.grid.trapezoid import NoConvergenceError, Stepper
+
+Floats = npt.NDArray[np.float64]
+Phasors = npt.NDArray[np.complex128]
+
+POWER_FLOW_TOLERANCE = 1e-9
+"""Largest mismatch, pu."""
+FLAT_START_TOLERANCE = 1e-6
+"""Largest residual of any equation before the fault, pu."""
+SLACK_TOLERANCE = 1e-7
+"""Largest difference between the unit at the slack bus and its share, pu."""
+COLLAPSED = 0.01
+"""Voltage just after clearing, pu, below which the faulted bus counts as not recovered."""
+LOST_SYNCHRONISM = np.pi
+"""Angle between a rotor and the centre of inertia, rad, from which on the rotor counts as out of step."""
+
+
+class OperatingPoint:
+    """A case at one hosting vector and period, initialised and ready for faults.
+
+    Parameters
+    ----------
+    system : andes.System
+        As `read` gives it, with machines, not set up yet.
+    hosted : mapping of bus to complex MVA, import positive
+    wind : mapping of bus to MW
+    load_scale : float
+    faults : sequence of BusFault
+        Those that `simulate` will be asked for.
+    rule : str
+        How the units share the change of load, one of `redispatch.RULES`.
+    where : str
+        What messages call the operating point.
+
+    Raises
+    ------
+    SimulationError
+        When power flow or initialisation has no solution, or a unit starts outside its limits.
+    InfeasibleError
+        When the units cannot supply the load.
+    """
+
+    def __init__(
+        self,
+        system: Any,
+        hosted: Mapping[int, complex],
+        wind: Mapping[int, float],
+        load_scale: float,
+        faults: Sequence[BusFault],
+        rule: str,
+        where: str,
+    ) -> None:
+        self.system, self.where = system, where
+        base = float(system.config.mva)
+        volts = dict(zip(system.Bus.idx.v, system.Bus.Vn.v, strict=True))
+        loads = int(system.PQ.n)
+        for bus in dict.fromkeys([*hosted, *wind]):
+            power = (complex(hosted.get(bus, 0.0)) - wind.get(bus, 0.0)) / base
+            name = f"dcvrt load {bus}"
+            system.add("PQ", {"idx": name, "bus": bus, "Vn": volts[bus], "p0": power.real, "q0": power.imag})
+        self.fault_index = {fault: f"dcvrt fault {k}" for k, fault in enumerate(dict.fromkeys(faults))}
+        for fault, idx in self.fault_index.items():
+            system.add(
+                "Fault",
+                {"idx": idx, "bus": fault.bus, "tf": -1.0, "tc": -1.0, "xf": fault.x_f, "rf": fault.r_f},
+            )
+        with quiet() as said:
+            system.setup()
+            if not system.SynGen.n:
+                raise InputError(
+                    f"{where}: the case has no dynamic data, not one machine. Way out: add a machine "
+                    "(GENROU, GENCLS) for each generator, in a .dyr file given as dynamics=... or in the "
+                    "case itself."
+                )
+            reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
+            system.PQ.p0.v[:loads] *= load_scale
+            system.PQ.q0.v[:loads] *= load_scale
+            self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
+            self._initialise(said)
+
+    # -- power flow ----------------------------------------------------------------------------------------
+
+    def _power_flow(self, rule: str, more: float) -> None:
+        """Solve for `more` load, pu, with the unit at the slack bus generating its share too."""
+        system, slack = self.system, self.system.Slack
+        system.PFlow.config.tol = POWER_FLOW_TOLERANCE
+        units = (system.PV, slack)
+        p_set = np.concatenate([unit.p0.v * unit.u.v for unit in units])
+        p_max = np.concatenate([unit.pmax.v for unit in units])
+        if rule == "slack":
+            self._solve()
+        else:
+            total, surplus = float(p_set.sum()) + more, np.inf
+            while abs(surplus) > SLACK_TOLERANCE:  # contracts: the losses change by a small part of the load
+                p = redispatch.share(p_set, p_max, total)
+                system.PV.p0.v[:] = p[: system.PV.n]
+                self._solve()
+                surplus = float(slack.p.v.sum() - p[system.PV.n :].sum())
+                total += surplus
+        base = float(system.config.mva)
+        self.generation: dict[int, complex] = {}
+        for unit in units:
+            for bus, p, q in zip(unit.bus.v, unit.p.v, unit.q.v, strict=True):
+                self.generation[int(bus)] = self.generation.get(int(bus), 0j) + base * complex(p, q)
+        self.beyond_q_limits = tuple(
+            int(unit.bus.v[k])
+            for unit in units
+            for k in np.flatnonzero((unit.q.v > unit.qmax.v) | (unit.q.v < unit.qmin.v))
+        )
+        if not (slack.p.v >= 0).all() or not (slack.p.v <= slack.pmax.v).all():
+            raise SimulationError(
+                f"{self.where}: the unit at slack bus {slack.bus.v[0]} would generate "
+                f"{base * slack.p.v[0]:.0f} MW, outside 0 to {base * slack.pmax.v[0]:.0f} MW. "
+                "Way out: redispatch='proportional', or host less."
+            )
+
+    def _solve(self) -> None:
+        """One power flow."""
+        system = self.system
+        system.PFlow.run()
+        if system.PFlow.converged:
+            return
+        bus = system.Bus
+        mismatch = np.hypot(system.dae.g[bus.a.a], system.dae.g[bus.v.a])
+        worst = int(np.argmax(np.nan_to_num(mismatch, nan=np.inf)))
+        raise SimulationError(
+            f"{self.where}: power flow has no solution; the largest mismatch, "
+            f"{mismatch[worst] * float(system.config.mva):.3g} MVA, is at bus {bus.idx.v[worst]}. "
+            "Way out: host less there, or check load_scale and the voltage set points."
+        )
+
+    # -- initialisation ------------------------------------------------------------------------------------
+
+    def _initialise(self, said: Said) -> None:
+        """Initialise all dynamic devices; refuse a start that is not an equilibrium inside all limits."""
+        system, tds = self.system, self.system.TDS
+        limits = [
+            (model, limit)
+            for model in system.exist.tds.values()
+            if model.n
+            for part in model.discrete.values()
+            for limit in (getattr(part, "lower", None), getattr(part, "upper", None))
+            if hasattr(limit, "vin")
+        ]
+        before = [np.array(limit.v, dtype=float) for _, limit in limits]
+        tds.config.no_tqdm = 1
+        tds.config.criteria = 0
+        tds.init()
+        if not tds.initialized:
+            raise SimulationError(f"{self.where}: ANDES could not initialise the dynamic devices. {said}")
+        moved = []
+        for (model, limit), value in zip(limits, before, strict=True):
+            moved += [
+                f"{model.class_name} '{model.idx.v[k]}': {limit.name} = {value[k]:.4g} pu, but "
+                f"{limit.v[k]:.4g} pu is needed"
+                for k in np.flatnonzero(limit.v != value)
+            ]
+        if moved:
+            more = f"; and {len(moved) - 4} more" if len(moved) > 4 else ""
+            raise SimulationError(
+                f"{self.where}: {len(moved)} limit(s) are exceeded before the fault: {'; '.join(moved[:4])}"
+                f"{more}. ANDES would widen them and say nothing. Way out: host less, or give the unit a wider "
+                "limit."
+            )
+        residual = np.abs(system.dae.fg)
+        worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
+        if not residual[worst] <= FLAT_START_TOLERANCE:
+            raise SimulationError(
+                f"{self.where}: the start is no equilibrium; the largest residual, {residual[worst]:.3g} pu, "
+                f"is that of {system.dae.xy_name[worst]}. {said}".rstrip()
+            )
+        self.residual = float(residual[worst])
+
+    @property
+    def v0(self) -> Phasors:
+        """Bus voltages before the fault, pu, in the order of the buses."""
+        bus = self.system.Bus
+        y = self.system.TDS._y_t0
+        return np.asarray(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
+
+    def subtransient_admittance(self) -> Phasors:
+        """Admittance between each bus and the internal voltage of its machines, pu, in the order of the buses.
+
+        A machine with x_d'' != x_q'' enters with their mean.
+        """
+        system = self.system
+        position = {idx: k for k, idx in enumerate(system.Bus.idx.v)}
+        y = np.zeros(system.Bus.n, dtype=complex)
+        for model in system.SynGen.models.values():
+            if model.n:
+                x = 0.5 * (model.xd2.v + model.xq2.v) if hasattr(model, "xd2") else model.xd1.v
+                np.add.at(y, [position[bus] for bus in model.bus.v], model.ue.v / (model.ra.v + 1j * x))
+        return y
+
+    def load_admittance(self) -> Phasors:
+        """Admittance of the loads at the voltages before the fault, pu, in the order of the buses.
+
+        They keep it in the fault.
+        """
+        system = self.system
+        position = [list(system.Bus.idx.v).index(bus) for bus in system.PQ.bus.v]
+        y = np.zeros(system.Bus.n, dtype=complex)
+        load = system.PQ.u.v * (system.PQ.p0.v - 1j * system.PQ.q0.v)
+        np.add.at(y, position, load / np.abs(self.v0[position]) ** 2)
+        return y
+
+    # -- faults --------------------------------------------------------------------------------------------
+
+    def simulate(self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
+        """Voltages at `buses` on the times of the three stretches before, in and after the fault.
+
+        Parameters
+        ----------
+        fault : BusFault
+            One of those the operating point was made for.
+        times : three arrays
+            The first ends where the second begins, and so on; both sides of a jump are returned.
+
+        Returns
+        -------
+        v : complex array (times, buses)
+            Up to the time reached.
+        status : str
+            Empty when the end was reached, else the sentence that says what happened.
+        """
+        with quiet():
+            return self._simulate(fault, times, buses)
+
+    def _simulate(
+        self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]
+    ) -> tuple[Phasors, str]:
+        system = self.system
+        system.TDS.reinit()
+        address = [list(system.Bus.idx.v).index(bus) for bus in buses]
+        magnitude, angle = system.Bus.v.a[address], system.Bus.a.a[address]
+        device = system.Fault.idx2uid(self.fault_index[fault])
+        faulted = list(system.Bus.idx.v).index(fault.bus)
+        samples: list[Phasors] = []
+
+        def record() -> None:
+            y = system.dae.y
+            samples.append(y[magnitude] * np.exp(1j * y[angle]))
+
+        for _ in times[0]:  # an equilibrium, checked in `_initialise`: nothing moves before the fault
+            record()
+        stepper = Stepper(system)
+        stepper.t = fault.start
+        rotor = _Rotors(system)
+        before = system.dae.y.copy()
+        try:
+            for on, stretch in ((True, times[1]), (False, times[2])):
+                system.Fault.uf.v[device] = float(on)
+                # In polar form V = 0 solves the balance of a bus without load, so that a search which starts
+                # from the voltages of the fault ends there: the fault would never be cleared. Start from
+                # those before it.
+                stepper.event(before)
+                if not on and system.Bus.v.v[faulted] < COLLAPSED:
+                    raise NoConvergenceError(fault.cleared_at, f"the voltage at bus {fault.bus}")
+                record()
+                for t in stretch[1:]:
+                    stepper.advance(float(t))
+                    record()
+                    lost = rotor.out_of_step()
+                    if lost:
+                        return np.array(samples), f"lost synchronism at t = {t:.3f} s: {lost}."
+        except NoConvergenceError as failure:
+            v, what = system.Bus.v.v, "inception" if system.Fault.uf.v[device] else "clearing"
+            low = int(np.argmin(v))
+            return np.array(samples), (
+                f"voltage collapse or numerical failure after {what}, at t = {failure.t:.4f} s: the equations "
+                f"have no solution near the last one; {failure.variable} did not settle; lowest voltage "
+                f"{v[low]:.2f} pu at bus {system.Bus.idx.v[low]}."
+            )
+        finally:
+            self.iterations, self.factorisations = stepper.iterations, stepper.factorisations
+        return np.array(samples), ""
+
+
+class _Rotors:
+    """Rotor angles of all machines against their centre of inertia."""
+
+    def __init__(self, system: Any) -> None:
+        models = [model for model in system.SynGen.models.values() if model.n]
+        self.system = system
+        self.address = np.concatenate([model.delta.a for model in models])
+        self.inertia = np.concatenate([model.M.v * model.ue.v for model in models])
+        self.name = [f"{model.class_name} '{idx}'" for model in models for idx in model.idx.v]
+        self.on = self.inertia > 0
+
+    def out_of_step(self) -> str:
+        """Say which machine is furthest from the centre of inertia, when that is half a turn or more."""
+        delta = self.system.dae.x[self.address]
+        away = np.where(self.on, np.abs(delta - delta @ self.inertia / self.inertia.sum()), 0.0)
+        k = int(np.argmax(away))
+        if away[k] <= LOST_SYNCHRONISM:
+            return ""
+        return f"{self.name[k]} is {np.rad2deg(away[k]):.0f} deg from the centre of inertia"

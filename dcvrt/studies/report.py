@@ -1,0 +1,72 @@
+"""The report of a study: one HTML file that opens anywhere, without a network, and says first what was asked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from string import Template
+
+from dcvrt.studies import report_back, report_front
+from dcvrt.studies.figures import draw_all
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.outputs import write_atomically
+from dcvrt.studies.page import Safe, escape
+
+REPORT = "report.html"
+
+SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
+    report_front.answer,
+    report_front.plans,
+    report_front.failures,
+    report_front.closed_sites,
+    report_front.validation,
+    report_front.worst_cases,
+    report_back.grid,
+    report_back.facility,
+    report_back.simulations,
+    report_back.assumptions,
+    report_back.deviations,
+    report_back.method,
+    report_back.provenance,
+)
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` into the folder of a finished study; figures that are missing are drawn.
+
+    Parameters
+    ----------
+    folder : study folder.
+
+    Returns
+    -------
+    Path
+        The report.
+
+    Raises
+    ------
+    InputError
+        When the folder holds no finished study.
+    """
+    findings = Findings(Path(folder))
+    if not (findings.folder / "figures" / "framework.svg").is_file():
+        draw_all(findings.folder)
+    return write_atomically(findings.folder / REPORT, text_of(findings))
+
+
+def text_of(findings: Findings) -> str:
+    """The page as text."""
+    body = "\n".join(part for part in (make(findings) for make in SECTIONS) if part)
+    titles = re.findall(r'<section id="([^"]+)".*?<h2[^>]*>(.*?)</h2>', body, flags=re.DOTALL)
+    contents = "".join(f'<li><a href="#{anchor}">{title}</a></li>' for anchor, title in titles)
+    versions = findings.summary["versions"]
+    kind = "A quick run: fewer samples, periods and ratings than the study file asks for. " if findings.provenance["quick"] else ""
+    page = Template(resources.files("dcvrt.studies").joinpath("report.html").read_text(encoding="utf-8"))
+    return page.substitute(
+        title=escape(findings.study.study.name),
+        subtitle=escape(f"{kind}How much data-centre load the grid can host when every site must ride through the grid's faults."),
+        contents=contents, body=body,
+        footer=escape(f"Made by dcvrt {versions['dcvrt']} from the store of the study. Screening results in positive sequence; "
+                      "not a submission to a system operator."))

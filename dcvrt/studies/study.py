@@ -1,0 +1,277 @@
+"""A study: one file in, one folder out. Running it again resumes."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import dcvrt
+from dcvrt.errors import InputError
+from dcvrt.studies import checks, config, outputs, phases
+from dcvrt.studies.campaign import LOST, Campaign, crew_of
+from dcvrt.studies.config import StudyFile
+from dcvrt.studies.progress import Silent
+from dcvrt.studies.store import Store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PACKAGES = ("numpy", "scipy", "casadi", "andes", "highspy", "distributed", "pandas", "pydantic")
+DECIDING = ("dcvrt", "numpy", "scipy", "casadi", "andes", "highspy")
+"""Packages whose version may change a number: one folder is never made with two versions of them."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """A checked study file.
+
+    Attributes
+    ----------
+    file : the study.
+    text : the file as it was read; copied into the folder.
+    folder : what relative paths in it start from.
+    name : stem of the file, which names the default output folder.
+    """
+
+    file: StudyFile
+    text: str
+    folder: Path
+    name: str
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Study:
+        """Read and check a study file; without a path, the IEEE-118 study.
+
+        Raises
+        ------
+        InputError
+            With every mistake in the file.
+        """
+        if path is None:
+            return cls(checks.check(config.template(), "the IEEE-118 study", Path.cwd()), config.template(), Path.cwd(),
+                       "ieee118")
+        path = Path(path)
+        text = config.read_text(path)
+        return cls(checks.check(text, str(path), path.parent), text, path.resolve().parent, path.stem)
+
+    def run(self, out: str | Path | None = None, workers: int = 1, scheduler: str | None = None, quick: bool = False,
+            retry: bool = False, reporter: Silent | None = None) -> Result:
+        """Do what the folder does not have yet, and write the results.
+
+        Parameters
+        ----------
+        out : folder; default "NAME-results" or "NAME-quick" here. A folder of the same study is resumed.
+        workers : processes on this machine.
+        scheduler : address of a dask scheduler to use instead.
+        quick : fewer samples, periods and ratings, for a look at the whole chain.
+        retry : do once more what was set aside.
+        reporter : shows progress.
+
+        Returns
+        -------
+        Result
+
+        Raises
+        ------
+        InputError
+            When the folder holds another study, or was made with other versions.
+        InfeasibleError
+            When the network cannot serve its own load; nothing is written then.
+        """
+        begin = time.monotonic()
+        file = self.file.quick() if quick else self.file
+        folder = Path(out) if out is not None else Path(f"{self.name}-{'quick' if quick else 'results'}")
+        reporter = reporter or Silent()
+        crew = crew_of(workers, scheduler)  # before any work: a wrong number of workers is bad input
+        reporter.say(f"{file.study.name}{' (quick)' if quick else ''}: into {folder}")
+        if (folder / outputs.STORE).is_file():
+            with Store(folder / outputs.STORE) as store:
+                refuse_another_study(store, file, folder)
+        setting = self._setting(file)
+        reporter.say(f"without ride-through: {setting.no_vrt.total_mw:.2f} MW")
+        folder.mkdir(parents=True, exist_ok=True)
+        with Store(folder / outputs.STORE, write=True) as store:
+            refuse_another_study(store, file, folder)
+            self._note(store, file, setting, quick)
+            outputs.write_atomically(folder / outputs.STUDY, self.text)
+            if retry and store.reopen(*LOST):
+                (folder / outputs.SUMMARY).unlink(missing_ok=True)
+            backends = prepare(file, setting)
+            store.note(backends=backends)
+            for mode, backend in backends.items():
+                reporter.say(f"{mode}: {backend}")
+            with crew as hands, reporter:
+                campaign = Campaign(store, hands, file.run.task_timeout_s, file.run.tries, reporter)
+                try:
+                    lost = phases.run_samples(campaign, setting)
+                    fits = phases.run_fits(store, setting)
+                    phases.run_plans(store, setting, fits, reporter)
+                    lost += phases.run_replays(campaign, setting)
+                finally:
+                    store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
+            outputs.write_results(folder, store)
+        result = Result(folder, lost)
+        result.report()
+        return result
+
+    def _setting(self, file: StudyFile) -> phases.Setting:
+        """Hosting programme, periods and the plan without ride-through."""
+        from dcvrt.planning.hosting import HostingProblem
+
+        network, problems = checks.read_network(file.grid, self.folder)
+        if network is None:
+            raise InputError("; ".join(problems))
+        h = file.hosting
+        year = checks.profiles_of(h, self.folder)
+        problem = HostingProblem(network, tuple(file.grid.sites), year, rating_scale=h.rating_scale,
+                                 voltage=(h.v_min_pu, h.v_max_pu), pf=h.pf)
+        chosen = year.representative(network)
+        periods = {}
+        for entry in file.period:
+            hour = year.at(chosen[entry.hour] if isinstance(entry.hour, str) else entry.hour)
+            periods[entry.name] = {"name": entry.name, "hour": hour.hour, "load_scale": hour.load, "dc_factor": hour.dc,
+                                   "wind": {str(bus): mw for bus, mw in hour.wind.items()}}
+        return phases.Setting(file, self.folder, problem, periods, problem.solve())
+
+    def _note(self, store: Store, file: StudyFile, setting: phases.Setting, quick: bool) -> None:
+        """Write down what the study is and what it is made with."""
+        from dcvrt import facility
+
+        with store.transaction():
+            store.note(
+                study=file.canonical(), study_name=file.study.name, study_text=self.text, quick=quick,
+                versions=versions(), platform=platform.platform(), engine=file.grid.engine, seed=file.study.seed,
+                periods=setting.periods, criteria=phases.criteria(file), sites=list(setting.sites),
+                sources=dict(setting.problem.year.sources), network=setting.problem.network.name,
+                faults=[fault.model_dump() for fault in file.fault],
+                facilities={mode: [{"path": row.path, "value": row.value, "unit": row.unit, "doc": row.doc,
+                                    "source": row.source} for row in facility.get(mode).compile().parameters]
+                            for mode in file.facility.modes},
+                parameters={mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
+                            for mode in file.facility.modes})
+
+
+@dataclass(frozen=True)
+class Result:
+    """A study folder.
+
+    Attributes
+    ----------
+    folder : where everything is.
+    lost : the tasks that were set aside, one line each.
+    """
+
+    folder: Path
+    lost: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, folder: str | Path) -> Result:
+        """The result in a study folder.
+
+        Raises
+        ------
+        InputError
+            When the folder holds no finished study.
+        """
+        folder = Path(folder)
+        with Store(folder / outputs.STORE) as store:
+            unfinished = store.plans().empty or not store.plans().query("method != 'none'").replayed.all()
+            tasks = store.tasks()
+        if unfinished:
+            raise InputError(f"{folder}: the study is not finished. Way out: the same 'dcvrt study run' resumes it.")
+        away = tasks[tasks.status.isin(LOST)]
+        return cls(folder, [f"{t.phase} task {t.hash[:12]}: {t.status}: {t.message}" for t in away.itertuples()])
+
+    @property
+    def complete(self) -> bool:
+        """Whether no task was set aside."""
+        return not self.lost
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` says."""
+        found: dict[str, Any] = json.loads((self.folder / outputs.SUMMARY).read_text(encoding="utf-8"))
+        return found
+
+    def table(self) -> pd.DataFrame:
+        """One row per plan: capacities, replay and power-flow verdicts."""
+        with Store(self.folder / outputs.STORE) as store:
+            return outputs.plan_table(store)
+
+    def report(self) -> list[Path]:
+        """Write tables, figures and report again from the store; the files written."""
+        from dcvrt.studies.figures import draw_all
+        from dcvrt.studies.report import write_report
+
+        with Store(self.folder / outputs.STORE) as store:
+            files = outputs.write_results(self.folder, store)
+        return [*files, *draw_all(self.folder), *write_report(self.folder)]
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that a number may depend on."""
+    found = {"dcvrt": dcvrt.__version__, "python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def prepare(file: StudyFile, setting: phases.Setting) -> dict[str, str]:
+    """Let what is generated once per machine be generated here, before workers would do it at the same time.
+
+    Returns
+    -------
+    dict
+        How the facility of each mode is evaluated: the compiler, or the interpreter.
+    """
+    from dcvrt.planning import replay
+
+    return {mode: replay.prepare(setting.request([0.0] * len(setting.sites), next(iter(setting.periods)), [(mode, 1.0)],
+                                                 keep=False))
+            for mode in file.facility.modes}
+
+
+def refuse_another_study(store: Store, file: StudyFile, folder: Path) -> None:
+    """Refuse a folder that was made from another study, or with versions that may give other numbers.
+
+    Raises
+    ------
+    InputError
+        Naming what differs.
+    """
+    known = store.provenance()
+    if "study" not in known:
+        return
+    before, now = flat(known["study"]), flat(file.canonical())
+    changed = [f"{key}: was {before.get(key, 'not there')}, is {now.get(key, 'not there')}"
+               for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
+    way_out = "Way out: take another folder with --out, or undo the change"
+    if changed:
+        shown = "\n".join(f"  {line}" for line in changed[:8]) + (f"\n  ... {len(changed) - 8} more" if len(changed) > 8 else "")
+        raise InputError(f"{folder} holds the results of another study:\n{shown}\n{way_out}.")
+    here = versions()
+    other = [f"  {name}: was {known['versions'].get(name)}, is {here[name]}" for name in DECIDING
+             if known["versions"].get(name) != here[name]]
+    if other:
+        raise InputError(f"{folder} was made with other versions:\n" + "\n".join(other) + f"\n{way_out}.")
+
+
+def flat(data: Any, path: str = "") -> dict[str, str]:
+    """Nested plain data as one line per value.
+
+    >>> flat({"grid": {"sites": [1, 2]}, "fault": [{"bus": 3}]})
+    {'grid.sites': '[1, 2]', 'fault[1].bus': '3'}
+    """
+    if isinstance(data, dict) and data:
+        return {k: v for key, item in data.items() for k, v in flat(item, f"{path}.{key}" if path else str(key)).items()}
+    if isinstance(data, list) and data and isinstance(data[0], dict):
+        return {k: v for n, item in enumerate(data, 1) for k, v in flat(item, f"{path}[{n}]").items()}
+    return {path: json.dumps(data)}

@@ -1,0 +1,299 @@
+"""Requirement rows, sites that close, and every message of the hosting problem in full."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dcvrt.errors import InfeasibleError, InputError
+from dcvrt.grid.network import Network
+from dcvrt.planning import HostingProblem, Row, profiles
+from tests.planning.test_hosting import solve_file
+
+SITES = (21, 75, 106, 108)
+NETWORK = Network.ieee118()
+YEAR = profiles.ieee118().window(range(8424, 8448))
+
+
+@pytest.fixture(scope="module")
+def problem() -> HostingProblem:
+    return HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+
+
+def margin(site: int, intercept: float, slope: float, label: str = "") -> Row:
+    """intercept + slope * (own + half of each other) >= 0, as a row of the site."""
+    return Row(
+        {bus: slope * (1.0 if bus == site else 0.5) for bus in SITES},
+        -intercept,
+        label or f"margin at {site}",
+        site,
+    )
+
+
+def test_rows_that_hold_change_nothing(problem: HostingProblem) -> None:
+    free = problem.solve()
+    held = problem.solve([margin(bus, 10.0, -1e-3) for bus in SITES])
+    assert held.total_mw == pytest.approx(free.total_mw, abs=1e-5)
+    assert held.closed == {}
+
+
+def test_row_without_a_site_binds_with_its_price(problem: HostingProblem) -> None:
+    plan = problem.solve([Row({75: -1.0}, -50.0, "at most 50 MW at 75")])
+    assert plan.by_site[75] == pytest.approx(50.0)
+    (row,) = (b for b in plan.binding if b.kind == "row")
+    less = problem.solve([Row({75: -1.0}, -50.0 - 0.01, "at most 50.01 MW at 75")])
+    assert row.label == "at most 50 MW at 75"
+    assert (less.total_mw - plan.total_mw) / 0.01 == pytest.approx(row.price, rel=1e-3)
+
+
+def test_site_whose_row_fails_at_zero_is_closed_with_the_reason(problem: HostingProblem) -> None:
+    plan = problem.solve([margin(75, -0.02, -1e-4, "loss at 75, fault 79, GFL, beta 1.10")])
+    assert plan.by_site[75] == 0.0
+    beside = sum(plan.by_site.values())
+    short = 0.02 + 0.5e-4 * beside
+    assert plan.closed == {
+        75: f"loss at 75, fault 79, GFL, beta 1.10: {short:.4g} short at 0 MW beside the other sites"
+    }
+    assert plan.total_mw > 200
+
+
+def test_every_site_may_close(problem: HostingProblem) -> None:
+    plan = problem.solve([margin(bus, -1.0, -1e-4) for bus in SITES])
+    assert plan.total_mw == 0.0
+    assert set(plan.closed) == set(SITES)
+    assert plan.certificate.hours == len(YEAR)
+
+
+def test_choice_of_open_sites_equals_enumeration(problem: HostingProblem) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        rows = [
+            Row(
+                {b: -rng.uniform(0.2, 1.0) * 1e-3 for b in SITES},
+                -rng.uniform(-0.02, 0.3),
+                f"row {k} of {bus}",
+                bus,
+            )
+            for bus in SITES
+            for k in range(2)
+        ]
+        best = 0.0
+        for count in range(1, 5):
+            for open_sites in itertools.combinations(SITES, count):
+                closed = [Row({bus: -1.0}, 0.0, "closed") for bus in SITES if bus not in open_sites]
+                held = [Row(row.coefficients, row.lower, row.label) for row in rows if row.site in open_sites]
+                try:
+                    best = max(best, problem.solve([*closed, *held]).total_mw)
+                except InfeasibleError:
+                    continue
+        plan = problem.solve(rows)
+        assert plan.total_mw == pytest.approx(best, abs=1e-4)
+        assert plan.gap == pytest.approx(0.0, abs=1e-6)
+        for row in rows:
+            if plan.by_site[row.site] > 0:  # type: ignore[index]
+                assert row.value(plan.by_site) >= -1e-7
+
+
+def test_file_with_rows_and_choices_has_the_same_optimum(tmp_path: Path) -> None:
+    problem = HostingProblem(
+        NETWORK, SITES, YEAR.window(range(8436, 8444)), rating_scale=0.6, voltage_screen="one-shot"
+    )
+    rows = [
+        margin(21, 0.02, -1e-3),
+        margin(75, -0.01, -1e-4),
+        margin(106, 0.15, -1e-3),
+        margin(108, 0.1, -5e-4),
+    ]
+    plan = problem.solve(rows)
+    assert 0 < plan.total_mw < 300
+    problem.write_mps(tmp_path / "rows.mps", rows=rows)
+    assert plan.total_mw == pytest.approx(solve_file(tmp_path / "rows.mps")[0], rel=1e-6)
+
+
+def test_smallest_size_closes_a_site_that_cannot_reach_it() -> None:
+    small = HostingProblem(
+        NETWORK, SITES, YEAR, rating_scale=0.6, min_size={21: 40.0, 75: 0.0, 106: 0.0, 108: 0.0}
+    )
+    plan = small.solve()
+    assert plan.by_site[21] == 0.0
+    assert plan.closed[21].startswith("hosting here gains nothing within the shared limits (voltage bus")
+
+
+def test_bounds_narrow_the_sizes_of_open_sites(problem: HostingProblem) -> None:
+    plan = problem.solve(bounds={75: (0.0, 60.0), 108: (10.0, 20.0)})
+    assert plan.by_site[75] == pytest.approx(60.0)
+    assert plan.by_site[108] == pytest.approx(20.0)
+    free = problem.solve()
+    assert plan.total_mw < free.total_mw
+
+
+def test_capacity_never_falls_as_rows_are_relaxed(problem: HostingProblem) -> None:
+    totals = [
+        problem.solve([margin(bus, 0.05 * k - 0.1 + 0.01 * i, -3e-4) for i, bus in enumerate(SITES)]).total_mw
+        for k in range(6)
+    ]
+    assert all(more >= less - 1e-5 for less, more in itertools.pairwise(totals))
+    assert totals[0] == 0.0
+    assert totals[-1] > 300
+
+
+# -- messages ----------------------------------------------------------------------------------------------
+
+
+def test_arguments_are_refused_together() -> None:
+    with pytest.raises(InputError) as error:
+        HostingProblem(
+            NETWORK,
+            (21, 21, 1180),
+            YEAR,
+            rating_scale=0.0,
+            voltage=(1.06, 0.94),
+            pf=1.2,
+            h_max={21: 5.0},
+            voltage_screen="oneshot",
+        )
+    known = "Known: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, ... (118 in all)."
+    assert str(error.value) == (
+        "hosting problem: 7 problems\n"
+        f"  site 1180 is not a bus of ieee118. Did you mean '118'? {known}\n"
+        "  site 21 is listed more than once.\n"
+        "  rating_scale is 0; it must be a finite number above 0.\n"
+        "  voltage limits 1.06 to 0.94 pu must be positive and ascending.\n"
+        "  pf is 1.2; it must be above 0 and at most 1.\n"
+        "  voltage_screen 'oneshot' is unknown. Did you mean 'one-shot'? Known: relinearised, one-shot.\n"
+        "  h_max says nothing about site 1180."
+    )
+
+
+def test_smallest_size_above_the_largest_is_refused() -> None:
+    with pytest.raises(InputError) as error:
+        HostingProblem(NETWORK, SITES, YEAR, h_max=50.0, min_size=60.0)
+    assert str(error.value).splitlines()[:2] == [
+        "hosting problem: 4 problems",
+        "  min_size 60 MW at site 21 exceeds its h_max 50 MW.",
+    ]
+
+
+def test_negative_size_is_refused() -> None:
+    with pytest.raises(InputError) as error:
+        HostingProblem(NETWORK, (21,), YEAR, h_max=-1.0)
+    assert str(error.value) == (
+        "hosting problem: 2 problems\n"
+        "  h_max of site 21 is -1 MW; it must be finite and not negative.\n"
+        "  min_size 0 MW at site 21 exceeds its h_max -1 MW."
+    )
+
+
+def test_wind_at_an_unknown_bus_is_refused() -> None:
+    with pytest.raises(InputError) as error:
+        HostingProblem(NETWORK, SITES, profiles.ieee118({690: 10.0}).window(range(4)))
+    assert str(error.value) == (
+        "hosting problem: wind bus 690 is not a bus of ieee118. Did you mean '90'? "
+        "Known: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, ... (118 in all)."
+    )
+
+
+def test_row_that_names_no_site_is_refused(problem: HostingProblem) -> None:
+    with pytest.raises(InputError) as error:
+        problem.solve([Row({76: 1.0}, 0.0, "m"), Row({75: float("nan")}, 0.0, "n", 75)])
+    assert str(error.value) == (
+        "requirement rows: 2 problems\n"
+        "  row 'm' names 76, which is not a site. Known: 21, 75, 106, 108.\n"
+        "  row 'n' has a coefficient or a limit that is not finite."
+    )
+
+
+def test_bounds_are_refused_together(problem: HostingProblem) -> None:
+    with pytest.raises(InputError) as error:
+        problem.solve(bounds={5: (0.0, 1.0), 75: (2.0, 1.0), 106: (600.0, 700.0)})
+    assert str(error.value) == (
+        "bounds: 3 problems\n"
+        "  5 is not a site. Did you mean '75'? Known: 21, 75, 106, 108.\n"
+        "  the range of site 75 is 2 to 1 MW; it must be ascending and not negative.\n"
+        "  the range of site 106, 600 to 700 MW, has nothing in common with its sizes 0 to 500 MW."
+    )
+
+
+def test_rows_that_no_plan_meets_are_named(problem: HostingProblem) -> None:
+    with pytest.raises(InfeasibleError) as error:
+        problem.solve([Row({21: 1.0}, 1e4, "aggregate loss, fault 22")])
+    assert str(error.value) == (
+        "No capacities meet all requirement rows, not even with every site closed. Rows that hold for every "
+        "plan: aggregate loss, fault 22. Ways out: give a row the site that it belongs to, so that the site "
+        "can be closed, or relax its limit."
+    )
+
+
+def test_overloaded_base_case_names_hours_lines_and_amount() -> None:
+    with pytest.raises(InfeasibleError) as error:
+        HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.4, voltage=None).solve()
+    first, worst, way = str(error.value).splitlines()
+    assert first == (
+        "ieee118: the base case has no dispatch in 3 of 24 hours (hours 8440, 8441, 8442) "
+        "with nothing hosted."
+    )
+    assert worst == (
+        "  Worst hour 8442: branches are overloaded by 1.709 MW whatever the dispatch: "
+        "77-78 (rated 60.4 MVA), 77-80 (rated 56.4 MVA)."
+    )
+    assert way == (
+        "Ways out: a larger rating_scale (now 0.4), or more generation behind these branches, "
+        "or leave these hours out."
+    )
+
+
+def test_base_case_without_enough_units_says_so() -> None:
+    units = NETWORK.generators
+    weak = replace(NETWORK, generators=replace(units, p_max=0.35 * units.p_max))
+    with pytest.raises(InfeasibleError) as error:
+        HostingProblem(weak, SITES, YEAR, rating_scale=10.0, voltage=None).solve()
+    lines = str(error.value).splitlines()
+    assert lines[0].startswith(
+        "ieee118: the base case has no dispatch in 10 of 24 hours (hours 8433, 8434, 8435, "
+    )
+    assert lines[1] == (
+        "  Worst hour 8442: units that give 0 to 3488.2 MW cannot meet a net load of 3835.4 MW "
+        "(347.2 MW off)."
+    )
+    assert lines[2] == "Ways out: more units, or other limits of theirs, or leave these hours out."
+
+
+def test_voltages_outside_the_limits_before_hosting_are_named() -> None:
+    with pytest.raises(InfeasibleError) as error:
+        HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06)).solve()
+    lines = str(error.value).splitlines()
+    assert lines[0] == "ieee118: with nothing hosted 3 bus(es) are outside the voltage limits 0.95-1.06 pu."
+    assert lines[1] == "  bus 53: outside in 14 hours, worst 0.9459 pu in hour 8441"
+    assert lines[3] == "  bus 76: holds its set point 0.9430 pu"
+    assert lines[-1] == (
+        "Ways out: wider limits (voltage=...), other set points, or base_violations='hold', with which "
+        "these voltages must only not get worse."
+    )
+
+
+def test_voltages_outside_the_limits_can_be_held() -> None:
+    held = HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06), base_violations="hold")
+    plan = held.solve()
+    assert plan.voltage is not None
+    assert plan.voltage.widened > 24
+    assert 0 <= plan.total_mw < 300
+    assert held.check_ac(plan).passed
+
+
+def test_path_that_cannot_be_written_is_refused(problem: HostingProblem, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        problem.write_mps(tmp_path / "check.lp", hours=range(8424, 8425))
+    assert str(error.value) == f"{tmp_path / 'check.lp'}: the file must be called .mps."
+    with pytest.raises(InputError) as error:
+        problem.write_mps(tmp_path / "none" / "check.mps", hours=range(8424, 8425))
+    assert str(error.value) == f"{tmp_path / 'none' / 'check.mps'}: there is no folder {tmp_path / 'none'}."
+
+
+def test_hours_outside_the_problem_are_refused(problem: HostingProblem, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        problem.write_mps(tmp_path / "check.mps", hours=range(10))
+    assert str(error.value) == "hour 0 is not among the 24 operating hours (8424 to 8447)."
