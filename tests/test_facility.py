@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dcvrt import facility
 from dcvrt.errors import InputError
-from dcvrt.models import Cooling, Pll
+from dcvrt.models import Cooling, Diagram, Phasor, Pll
 from tests.models.ride import System, ride, sag
 
 VARIANTS = ("gfl", "gfm")
@@ -102,6 +102,21 @@ def test_a_variant_can_be_changed_before_it_is_compiled():
     values = dict(zip(dae.p_names, dae.parameter_values(), strict=True))
     assert (values["cooling.T"], values["cooling.rho"], values["vsm.H_v"]) == (120.0, 0.8, 1.0)
     assert "cooling.H" not in values  # the binding to H stayed
+
+
+def test_a_diagram_is_wired_from_nothing():
+    d = Diagram("mine")
+    d.parameter("H", 1.0, "pu(S)")
+    v = d.input("v_poi", "pu(V)", Phasor)
+    pll = d.add("pll", Pll(K_p=60.0, K_i=1400.0))
+    d.connect(v, pll.v)
+    d.output("omega", pll.omega)
+    dae = d.compile()
+    assert dae.y_names == ("omega",)
+    lines = str(dae.parameters).splitlines()
+    assert lines[0].split() == ["parameter", "value", "unit", "bounds", "meaning", "source"]
+    assert "proportional gain" in lines[2]
+    assert lines[2].endswith("set by the user")
 
 
 def test_the_sheet_shows_equations_parameters_modes_and_deviations():

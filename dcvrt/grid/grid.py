@@ -289,8 +289,8 @@ class Grid:
             )
         if facilities is not None:
             problems.append(
-                "facilities: coupling them into the network needs the native engine, which does not exist yet. "
-                "Way out: run each facility on the waveform that this call returns without facilities=."
+                "facilities: coupling them into the network needs the native engine, which does not exist "
+                "yet. Way out: run each facility on the waveform that this call returns without facilities=."
             )
         for bus, mw in hosting.items():
             if bus not in self.sites:

@@ -148,15 +148,15 @@ class OperatingPoint:
     def _initialise(self, said: Said) -> None:
         """Initialise all dynamic devices; refuse a start that is not an equilibrium inside all limits."""
         system, tds = self.system, self.system.TDS
-        limits = [
-            (model, limit)
+        limits: list[tuple[Any, Any]] = [
+            (model, getattr(part, side))
             for model in system.exist.tds.values()
             if model.n
             for part in model.discrete.values()
-            for limit in (getattr(part, "lower", None), getattr(part, "upper", None))
-            if hasattr(limit, "vin")
+            for side in ("lower", "upper")
+            if hasattr(getattr(part, side, None), "vin")
         ]
-        before = [np.array(limit.v, dtype=float) for _, limit in limits]
+        before = [limit.v.copy() for _, limit in limits]
         tds.config.no_tqdm = 1
         tds.config.criteria = 0
         tds.init()
@@ -173,8 +173,8 @@ class OperatingPoint:
             more = f"; and {len(moved) - 4} more" if len(moved) > 4 else ""
             raise SimulationError(
                 f"{self.where}: {len(moved)} limit(s) are exceeded before the fault: {'; '.join(moved[:4])}"
-                f"{more}. ANDES would widen them and say nothing. Way out: host less, or give the unit a wider "
-                "limit."
+                f"{more}. ANDES would widen them and say nothing. Way out: host less, or give the unit a "
+                "wider limit."
             )
         residual = np.abs(system.dae.fg)
         worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
@@ -193,7 +193,7 @@ class OperatingPoint:
         return np.asarray(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
 
     def subtransient_admittance(self) -> Phasors:
-        """Admittance between each bus and the internal voltage of its machines, pu, in the order of the buses.
+        """Admittance between each bus and the internal voltage of its machines, pu, in bus order.
 
         A machine with x_d'' != x_q'' enters with their mean.
         """
@@ -281,9 +281,10 @@ class OperatingPoint:
             v, what = system.Bus.v.v, "inception" if system.Fault.uf.v[device] else "clearing"
             low = int(np.argmin(v))
             return np.array(samples), (
-                f"voltage collapse or numerical failure after {what}, at t = {failure.t:.4f} s: the equations "
-                f"have no solution near the last one; {failure.variable} did not settle; lowest voltage "
-                f"{v[low]:.2f} pu at bus {system.Bus.idx.v[low]}."
+                f"voltage collapse or numerical failure after {what}, at t = {failure.t:.4f} s: no "
+                f"solution near the last one; {failure.variable} did not settle; lowest voltage "
+                f"{v[low]:.2f} pu "
+                f"at bus {system.Bus.idx.v[low]}."
             )
         finally:
             self.iterations, self.factorisations = stepper.iterations, stepper.factorisations

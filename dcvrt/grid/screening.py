@@ -155,7 +155,7 @@ def screen_faults(
        site has.
     4. Then milder faults up to `count`, in turn from the most limited site on: that which asks for a ratio
     nearest half
-       way between 1 and the site's own, and more than 1.
+       way between 1 and the site's own, more than 1, and not more of any site than it has by step 3.
 
     Ties go to the lower bus number.
 
@@ -295,15 +295,13 @@ def _choose(
         best = min(fits, key=lambda row: (abs(max(row.beta) - target), row.bus))
         ratio[best.limits] = max(best.beta)
         chosen[best.bus] = f"limits site {best.limits} at beta {max(best.beta):.2f}"
+    within = [row for row in open_rows if all(row.beta[sites.index(site)] <= ratio[site] for site in sites)]
     while len(chosen) < count:
         found = False
         for site in sorted(ratio, key=lambda site: -ratio[site]):
             half = 0.5 * (1 + ratio[site])
-            milder = [
-                row
-                for row in open_rows
-                if row.limits == site and row.bus not in chosen and 1 < max(row.beta) < ratio[site]
-            ]
+            milder = [row for row in within if row.limits == site and 1 < max(row.beta) < ratio[site]]
+            milder = [row for row in milder if row.bus not in chosen]
             if milder and len(chosen) < count:
                 best = min(milder, key=lambda row: (abs(max(row.beta) - half), row.bus))
                 chosen[best.bus] = f"milder fault at site {site}, beta {max(best.beta):.2f}"

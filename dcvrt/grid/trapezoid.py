@@ -19,6 +19,7 @@ converge is cut into halves within its interval.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ TOLERANCE = 1e-6
 """Largest last correction of any variable, pu or rad; the error that is left is smaller by `SLOW`."""
 ITERATIONS = 12
 EVENT_ITERATIONS = 60
-SLOW = 0.2
+SLOW = 0.05
 """A correction that shrinks by less than this factor refreshes the Jacobian."""
 HALVINGS = 6
 UNUSED = 1e-8
@@ -63,12 +64,9 @@ class Stepper:
     """
 
     def __init__(self, system: Any) -> None:
-        from kvxopt import klu, matrix, sparse, spdiag
-
-        self._klu: Any = klu
-        self._matrix: Any = matrix
-        self._sparse: Any = sparse
-        self._spdiag: Any = spdiag
+        kvxopt: Any = import_module("kvxopt")  # the sparse matrices that ANDES works in
+        self._klu = import_module("kvxopt.klu")
+        self._matrix, self._sparse, self._spdiag = kvxopt.matrix, kvxopt.sparse, kvxopt.spdiag
         self.system, self.dae, self.tds = system, system.dae, system.TDS
         self.models = system.exist.pflow_tds
         self.t = float(self.dae.t)
@@ -102,8 +100,8 @@ class Stepper:
         unit = np.where(self.instant, UNUSED, self.T)
         self._still = pegged
         if h == 0:
-            # A state without time constant that is not in its own equation (of a filter switched off by zeros)
-            # follows from the states that it drives, and these stay in an event: it waits for the next step.
+            # A state without time constant that is not in its own equation (of a filter switched off by
+            # zeros) follows from the states that it drives. Those stay in an event, so it waits for a step.
             own = np.ravel(self._matrix(dae.fx[:: self.n + 1]))
             self._still = np.union1d(pegged, np.flatnonzero(self.instant & (own == 0)))
         scale[self._still], unit[self._still] = 0.0, 1.0

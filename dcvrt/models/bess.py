@@ -26,7 +26,7 @@ class Bess(Block):
     law, its deadband and its limits are ours. The deadband leaves small errors to the grid converter.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
     T_b = Parameter(0.01, "s", (1e-3, 0.2), "lag of the battery converter", "illustrative: 2-12 ms")
     P_dis = Parameter(1.2, "1", (0.0, 3.0), "discharge limit over H", "illustrative: carries the whole load")
     P_ch = Parameter(0.1, "1", (0.0, 3.0), "charge limit over H", "illustrative")

@@ -19,8 +19,10 @@ class Cooling(Block):
 
     T = Parameter(30.0, "s", (0.1, 7200.0), "thermal time constant", "illustrative: 30-60 s")
     rho = Parameter(0.6, "1", (0.0, 1.5), "how far cooling follows the servers", "illustrative: 0.3-0.6")
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
-    d = Parameter(1.0, "1", (0.0, 1.2), "load factor: facility demand over hosted capacity at g = 1")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
+    d = Parameter(
+        1.0, "1", (0.0, 1.2), "load factor: facility demand over hosted capacity at g = 1", "full load"
+    )
     share = Parameter(
         0.17,
         "1",

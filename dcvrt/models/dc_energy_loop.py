@@ -30,11 +30,15 @@ class DcEnergyLoop(Block):
     current yields to active current in the limiter, and the grid-following mode gives no voltage support.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
     beta = Parameter(1.15, "1", (0.5, 3.0), "converter rating over hosted capacity", "illustrative")
     pf = Parameter(0.98, "1", (0.8, 1.0), "power factor of the import, lagging", "illustrative")
     K_p = Parameter(
-        4.0, "1", (0.01, 100.0), "proportional gain over H", "illustrative: half the current loop's"
+        4.0,
+        "1",
+        (0.01, 100.0),
+        "proportional gain over H",
+        "illustrative: half the bandwidth of the current loop",
     )
     K_i = Parameter(20.0, "1/s", (0.0, 1000.0), "integral gain over H", "illustrative")
     eps = Parameter(

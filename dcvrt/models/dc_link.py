@@ -20,7 +20,7 @@ class DcLink(Block):
     Differs: losses are counted in PUE, hence eta = 1 unless set; below 1 they are drawn on top of the demand.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
     T_hold = Parameter(
         0.03, "s", (1e-3, 1.0), "nominal energy over H: hold-up time", "illustrative: 20-30 ms"
     )

@@ -52,7 +52,7 @@ class ActivePriorityLimiter(Block):
     """
 
     beta = Parameter(1.15, "1", (0.5, 3.0), "converter rating over hosted capacity", "illustrative")
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
     w_full = Parameter(1.25, "1", (1.0, 2.0), "DC energy at which no more is imported", "illustrative")
     w_fade = Parameter(0.10, "1", (1e-3, 0.5), "DC energy over which the import closes", "illustrative")
     eps = Parameter(

@@ -21,8 +21,8 @@ class ItLoad(Block):
     Differs: the servers take what their supplies pass on; see the block of the supply.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), H_DOC)
-    d = Parameter(1.0, "1", (0.0, 1.2), D_DOC)
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), H_DOC, "decision of the planner")
+    d = Parameter(1.0, "1", (0.0, 1.2), D_DOC, "full load")
     share = Parameter(0.77, "1", (0.0, 1.0), "share of the demand at g = 1", "1/PUE, PUE 1.3: illustrative")
 
     g_it = Input("1", "normalised IT load")
@@ -41,8 +41,8 @@ class AuxiliaryLoad(Block):
     Paper: eq. (dc_dynamic_load). PUE counts conversion losses, so they are inside this share.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), H_DOC)
-    d = Parameter(1.0, "1", (0.0, 1.2), D_DOC)
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), H_DOC, "decision of the planner")
+    d = Parameter(1.0, "1", (0.0, 1.2), D_DOC, "full load")
     share = Parameter(
         0.06, "1", (0.0, 1.0), "share of the demand at g = 1", "PUE 1.3, a quarter of the rest: illustrative"
     )

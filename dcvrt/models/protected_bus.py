@@ -21,7 +21,7 @@ class ProtectedBus(Block):
     Differs: the paper names an output stage and gives no equation; this is ours, the same in both modes.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity")
+    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
     beta = Parameter(1.15, "1", (0.5, 3.0), "converter rating over hosted capacity", "illustrative")
     pf = Parameter(0.98, "1", (0.8, 1.0), "power factor of the load on the bus", "illustrative")
     V_set = Parameter(1.0, "pu(V)", (0.9, 1.1), "set point", "nominal voltage")

@@ -44,7 +44,9 @@ class Vsm(Block):
     would set it; without it the two modes would start from different operating points.
     """
 
-    H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity, the base of the impedance")
+    H = Parameter(
+        1.0, "pu(S)", (1e-6, 1e3), "hosted capacity, the base of the impedance", "decision of the planner"
+    )
     H_v = Parameter(
         0.075, "s", (0.01, 10.0), "virtual inertia", "as a droop with a 5 ms power filter, ANDES REGF1"
     )

@@ -261,7 +261,7 @@ def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
     m = data.margin(target, "paper")[chosen]
     fitted = data.fit[chosen] & data.ok[chosen]
     k = _coefficients(x, m, fitted, not_negative=[x.shape[1] - 1])
-    return [_tightened("paper", data, chosen, target, m, x @ k, k[0], k[1:-1], k[-1], period="", beta=0.0)]
+    return [_tightened("paper", data, chosen, target, m, _predict(x, k), k[0], k[1:-1], k[-1], period="", beta=0.0)]
 
 
 def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate]:
@@ -276,8 +276,7 @@ def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
     for period in periods:
         here = data.period[chosen] == period
         intercept = k[seen.index(period)] if period in seen else -np.inf
-        predicted = x[here] @ k if period in seen else np.full(int(here.sum()), -np.inf)
-        fits.append(_tightened("share", data, chosen[here], target, m[here], predicted, intercept, k[len(seen):], 0.0,
+        fits.append(_tightened("share", data, chosen[here], target, m[here], _predict(x[here], k), intercept, k[len(seen):], 0.0,
                                period=period, beta=float(data.beta[chosen[0]])))
     return fits
 
@@ -289,6 +288,10 @@ def _coefficients(x: Floats, m: Floats, fitted: Booleans, not_negative: Sequence
     k = np.zeros(x.shape[1])
     k[0] = -np.inf
     return k
+
+
+def _predict(x: Floats, k: Floats) -> Floats:
+    return x @ k if np.isfinite(k).all() else np.full(len(x), -np.inf)
 
 
 def _tightened(method: str, data: MarginData, chosen: npt.NDArray[np.int64], target: str, m: Floats, predicted: Floats,

@@ -6,6 +6,7 @@ rows of the summary and the store; none is written for a particular result.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -51,8 +52,11 @@ class Findings:
     def __post_init__(self) -> None:
         missing = [name for name in FILES if not (self.folder / name).is_file()]
         if missing:
-            raise InputError(f"{self.folder}: {' and '.join(missing)} not found, so this is not the folder of a study that "
-                             "has ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes.")
+            raise InputError(
+                f"{self.folder}: {' and '.join(missing)} not found, so this is not the folder of a study "
+                "that "
+                "has ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes."
+            )
 
     # -- what the folder holds -----------------------------------------------------------------------------
 
@@ -65,7 +69,9 @@ class Findings:
     def study(self) -> StudyFile:
         """The study as it was run: of a quick run the reduced one, which is not what `study.toml` says."""
         known = self.provenance
-        return StudyFile.model_validate(known["study"] | {"study": known["study"]["study"] | {"name": known["study_name"]}})
+        return StudyFile.model_validate(
+            known["study"] | {"study": known["study"]["study"] | {"name": known["study_name"]}}
+        )
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
@@ -190,7 +196,11 @@ class Findings:
 
     def rows(self, mode: str | None = None, method: str | None = None) -> list[Row]:
         """Rows of the summary of a mode and a method, by rising beta."""
-        chosen = [row for row in self.summary["rows"] if mode in (None, row["mode"]) and method in (None, row["method"])]
+        chosen = [
+            row
+            for row in self.summary["rows"]
+            if mode in (None, row["mode"]) and method in (None, row["method"])
+        ]
         return sorted(chosen, key=lambda row: (row["mode"], row["method"], row["beta"]))
 
     def facility(self, mode: str) -> Dae:
@@ -210,13 +220,16 @@ class Findings:
         """Difference below which two capacities count as equal."""
         return SAME_SHARE * max(self.no_vrt_mw, 1.0)
 
-    def best(self) -> Row | None:
-        """The replayed and passed row with the largest total; the smaller beta where totals are equal."""
-        passed = [row for row in self.rows() if verdict(row) == "passed" and ac_verdict(row) == "passed"]
+    def best(self, mode: str | None = None) -> Row | None:
+        """The row with the largest total that passed replay and power flow; the smaller beta where totals are equal."""
+        passed = [row for row in self.rows(mode) if verdict(row) == "passed" and ac_verdict(row) == "passed"]
         if not passed:
             return None
         most = max(float(row["total_mw"]) for row in passed)
-        return min((row for row in passed if row["total_mw"] >= most - self.tolerance_mw), key=lambda row: row["beta"])
+        return min(
+            (row for row in passed if row["total_mw"] >= most - self.tolerance_mw),
+            key=lambda row: row["beta"],
+        )
 
     def falls(self) -> list[str]:
         """A sentence for each step of beta at which the capacity falls."""
@@ -224,11 +237,14 @@ class Findings:
         for mode in self.modes:
             for method in self.methods:
                 rows = self.rows(mode, method)
-                for low, high in zip(rows, rows[1:], strict=False):
+                for low, high in itertools.pairwise(rows):
                     if high["total_mw"] < low["total_mw"] - self.tolerance_mw:
-                        said.append(f"{mode_name(mode)}, method {method}: capacity falls from {low['total_mw']:.1f} MW at "
-                                    f"β = {low['beta']:g} to {high['total_mw']:.1f} MW at β = {high['beta']:g}. "
-                                    f"What holds it back there: {self.limits_of(high)}")
+                        said.append(
+                            f"{mode_name(mode)}, method {method}: capacity falls from {low['total_mw']:.1f} "
+                            "MW at "
+                            f"β = {low['beta']:g} to {high['total_mw']:.1f} MW at β = {high['beta']:g}. "
+                            f"What holds it back there: {self.limits_of(high)}"
+                        )
         return said
 
     def shortfalls(self) -> list[str]:
@@ -239,9 +255,13 @@ class Findings:
                 rows = self.rows(mode, method)
                 if rows and rows[-1]["total_mw"] < self.no_vrt_mw - self.tolerance_mw:
                     top = rows[-1]
-                    said.append(f"{mode_name(mode)}, method {method}: at the highest β studied ({top['beta']:g}) "
-                                f"{top['total_mw']:.1f} MW can be hosted, {self.no_vrt_mw - top['total_mw']:.1f} MW less than "
-                                f"without ride-through ({self.no_vrt_mw:.1f} MW). What prevents more: {self.limits_of(top)}")
+                    said.append(
+                        f"{mode_name(mode)}, method {method}: at the highest β studied ({top['beta']:g}) "
+                        f"{top['total_mw']:.1f} MW can be hosted, {self.no_vrt_mw - top['total_mw']:.1f} MW "
+                        "less than "
+                        f"without ride-through ({self.no_vrt_mw:.1f} MW). What prevents more: "
+                        f"{self.limits_of(top)}"
+                    )
         return said
 
     def limits_of(self, row: Row) -> str:
@@ -256,7 +276,9 @@ class Findings:
     def plan(self, row: Row) -> Row:
         """The row of `plans` that belongs to a row of the summary."""
         plans = self.plans
-        found = plans[(plans.method == row["method"]) & (plans["mode"] == row["mode"]) & (plans.beta == row["beta"])]
+        found = plans[
+            (plans.method == row["method"]) & (plans["mode"] == row["mode"]) & (plans.beta == row["beta"])
+        ]
         return dict(found.iloc[0])
 
     def worst_case(self, mode: str | None = None) -> Case | None:
@@ -265,8 +287,11 @@ class Findings:
         Among the runs whose facility waveforms were kept: for every plan, those where its voltage margin and
         where its loss margin is least.
         """
-        replayed = self.margins[(self.margins.ok == 1) & (self.margins.h_mw > 0)
-                                & self.margins.hosting.isin(self.hostings.name[self.hostings.role == "plan"])]
+        replayed = self.margins[
+            (self.margins.ok == 1)
+            & (self.margins.h_mw > 0)
+            & self.margins.hosting.isin(self.hostings.name[self.hostings.role == "plan"])
+        ]
         if mode is not None:
             replayed = replayed[replayed["mode"] == mode]
         kept = self._kept_runs
@@ -276,13 +301,27 @@ class Findings:
             return None
         least = replayed[["v_margin_pu", "loss_margin_share"]].min(axis=1)
         row = replayed.loc[least.idxmin()]
-        return Case(str(row.hosting), str(row.period), str(row.fault), int(row.site), str(row["mode"]), float(row.beta),
-                    float(row.h_mw), float(row.v_margin_pu), float(row.loss_margin_share), str(row.sequence))
+        return Case(
+            str(row.hosting),
+            str(row.period),
+            str(row.fault),
+            int(row.site),
+            str(row["mode"]),
+            float(row.beta),
+            float(row.h_mw),
+            float(row.v_margin_pu),
+            float(row.loss_margin_share),
+            str(row.sequence),
+        )
 
     @cached_property
     def _kept_runs(self) -> set[tuple[Any, ...]]:
         """Runs whose facility waveforms are in the store."""
-        return {tuple(key[name] for name in Case.KEYS) for mode in self.modes for key, _ in self.waveforms(mode=mode)}
+        return {
+            tuple(key[name] for name in Case.KEYS)
+            for mode in self.modes
+            for key, _ in self.waveforms(mode=mode)
+        }
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """One look for every figure: a journal's column widths, colours that colour-blind readers can tell apart.
 
-Colours are those of Okabe and Ito. Nothing is told by colour alone: modes differ in marker, methods in line and
-filling, sites in hatching, a failed replay in its cross.
+Colours are those of Okabe and Ito. Nothing is told by colour alone: modes differ in marker, methods in line
+and filling, sites in hatching, a failed replay in its cross.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width: float = COLUMN, height: float = 2.6, arranged: bool = True) -> Figure:
-    """Return an empty figure of a size in inches that belongs to no window; `arranged` lays out its panels."""
+    """Return an empty figure of a size in inches, in no window; `arranged` lays out its panels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

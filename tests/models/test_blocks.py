@@ -117,6 +117,7 @@ def test_every_symbol_is_documented(kind):
             low, high = d.bounds
             assert low <= d.value <= high
             assert np.isfinite([low, high]).all(), f"{kind.__name__}.{name} has no bounds"
+            assert d.source != "not stated", f"{kind.__name__}.{name} does not say where its value comes from"
 
 
 FEEDTHROUGH = {

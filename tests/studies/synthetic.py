@@ -21,8 +21,12 @@ from dcvrt.studies.store import Store
 SITES = (21, 75, 106, 108)
 CORNER = (31.4, 153.9, 102.4, 104.1)
 PERIODS = {"peak": (8730, 1.0, 1.00, 40.0), "light": (1234, 0.45, 0.90, 260.0)}
-LEAST = {32: (0.690, 0.93, 0.95, 0.96), 65: (0.90, 0.730, 0.92, 0.93), 94: (0.95, 0.90, 0.760, 0.80),
-         111: (0.96, 0.94, 0.88, 0.670)}
+LEAST = {
+    32: (0.690, 0.93, 0.95, 0.96),
+    65: (0.90, 0.730, 0.92, 0.93),
+    94: (0.95, 0.90, 0.760, 0.80),
+    111: (0.96, 0.94, 0.88, 0.670),
+}
 """Retained voltage by fault at each site with nothing hosted, pu."""
 SLOPE = 1.5e-4
 """Fall of the retained voltage per MW at the site itself, pu; a fifth of it per MW elsewhere."""
@@ -31,11 +35,13 @@ SLOPE = 1.5e-4
 def study_file() -> StudyFile:
     """Return the built-in study, cut down to the faults and periods above."""
     file = load(template(), "template").quick()
-    return file.model_copy(update={
-        "fault": [f for f in file.fault if f.bus in LEAST],
-        "period": [p.model_copy(update={"hour": PERIODS[p.name][0]}) for p in file.period],
-        "sampling": file.sampling.model_copy(update={"n": 16}),
-    })
+    return file.model_copy(
+        update={
+            "fault": [f for f in file.fault if f.bus in LEAST],
+            "period": [p.model_copy(update={"hour": PERIODS[p.name][0]}) for p in file.period],
+            "sampling": file.sampling.model_copy(update={"n": 16}),
+        }
+    )
 
 
 def retained(fault: int, site: int, H: np.ndarray, d: float) -> float:
@@ -45,7 +51,9 @@ def retained(fault: int, site: int, H: np.ndarray, d: float) -> float:
     return LEAST[fault][k] - SLOPE * d * float(own @ H)
 
 
-def checked_run(file: StudyFile, period: str, fault: Any, site: int, mode: str, beta: float, H: np.ndarray) -> dict[str, Any]:
+def checked_run(
+    file: StudyFile, period: str, fault: Any, site: int, mode: str, beta: float, H: np.ndarray
+) -> dict[str, Any]:
     """One row of margins by the static loss law."""
     d, h = PERIODS[period][2], float(H[SITES.index(site)])
     v = retained(fault.bus, site, H, d)
@@ -53,14 +61,31 @@ def checked_run(file: StudyFile, period: str, fault: Any, site: int, mode: str, 
     limit = file.criteria.loss_share
     helps = {"gfl": 0.0, "gfm": 0.03}[mode]
     return {
-        "period": period, "fault": f"bus {fault.bus}, {fault.t_clear_ms:g} ms", "site": site, "mode": mode, "beta": beta,
-        "h_mw": h, "p_mw": d * h, "v_margin_pu": 0.08 + helps - 0.25 * max(0.0, 1.0 - beta * v),
-        "loss_margin_share": limit - share, "loss_margin_mw": d * h * (limit - share), "loss_share": share,
-        "loss_mw": d * h * share, "v_poi_min_pu": v, "status": "completed", "ok": 1, "failed_in": "",
-        "sequence": "NORMAL>MIXED>NORMAL", "battery": 0, "diagnostics": {}}
+        "period": period,
+        "fault": f"bus {fault.bus}, {fault.t_clear_ms:g} ms",
+        "site": site,
+        "mode": mode,
+        "beta": beta,
+        "h_mw": h,
+        "p_mw": d * h,
+        "v_margin_pu": 0.08 + helps - 0.25 * max(0.0, 1.0 - beta * v),
+        "loss_margin_share": limit - share,
+        "loss_margin_mw": d * h * (limit - share),
+        "loss_share": share,
+        "loss_mw": d * h * share,
+        "v_poi_min_pu": v,
+        "status": "completed",
+        "ok": 1,
+        "failed_in": "",
+        "sequence": "NORMAL>MIXED>NORMAL",
+        "battery": 0,
+        "diagnostics": {},
+    }
 
 
-def make(folder: Path, *, failing: bool = True, lost: bool = False, name: str = "A study of four sites") -> Path:
+def make(
+    folder: Path, *, failing: bool = True, lost: bool = False, name: str = "A study of four sites"
+) -> Path:
     """Write a finished study folder.
 
     Parameters
@@ -71,19 +96,41 @@ def make(folder: Path, *, failing: bool = True, lost: bool = False, name: str = 
     file = study_file()
     file = file.model_copy(update={"study": file.study.model_copy(update={"name": name})})
     folder.mkdir(parents=True, exist_ok=True)
-    samples = sample_hosting(CORNER, file.sampling.n, 1, high_share=0.5, high_from=0.6,
-                             validation_share=file.sampling.validation_share)
-    periods = {key: {"name": key, "hour": hour, "load_scale": load_scale, "dc_factor": d,
-                     "wind": {"69": wind, "80": wind, "89": wind}}
-               for key, (hour, load_scale, d, wind) in PERIODS.items()}
+    samples = sample_hosting(
+        CORNER,
+        file.sampling.n,
+        1,
+        high_share=0.5,
+        high_from=0.6,
+        validation_share=file.sampling.validation_share,
+    )
+    periods = {
+        key: {
+            "name": key,
+            "hour": hour,
+            "load_scale": load_scale,
+            "dc_factor": d,
+            "wind": {"69": wind, "80": wind, "89": wind},
+        }
+        for key, (hour, load_scale, d, wind) in PERIODS.items()
+    }
     setting = SimpleNamespace(file=file, sites=SITES, d={key: p["dc_factor"] for key, p in periods.items()})
     (folder / "study.toml").write_text(template(), encoding="utf-8")
     with Store(folder / "study.sqlite", write=True) as store:
         _note(store, file, periods)
         for k, H in enumerate(samples.hosting):
             key = f"s{k:04}"
-            store.put("hostings", [phases._hosting(key, "sample", "fit" if samples.fit[k] else "validation",
-                                                   dict(zip(SITES, H, strict=True)))])
+            store.put(
+                "hostings",
+                [
+                    phases._hosting(
+                        key,
+                        "sample",
+                        "fit" if samples.fit[k] else "validation",
+                        dict(zip(SITES, H, strict=True)),
+                    )
+                ],
+            )
             store.put("margins", [{"hosting": key, **row} for row in _rows(file, H)])
         if lost:
             _lose(store, file)
@@ -94,9 +141,14 @@ def make(folder: Path, *, failing: bool = True, lost: bool = False, name: str = 
 
 
 def _rows(file: StudyFile, H: np.ndarray, scale: float = 1.0) -> list[dict[str, Any]]:
-    rows = [checked_run(file, period.name, fault, site, mode, beta, H)
-            for period in file.period for fault in file.fault for site in SITES
-            for mode in file.facility.modes for beta in file.facility.beta]
+    rows = [
+        checked_run(file, period.name, fault, site, mode, beta, H)
+        for period in file.period
+        for fault in file.fault
+        for site in SITES
+        for mode in file.facility.modes
+        for beta in file.facility.beta
+    ]
     return [_weakened(row, file, scale) for row in rows] if scale != 1.0 else rows
 
 
@@ -104,24 +156,50 @@ def _weakened(row: dict[str, Any], file: StudyFile, scale: float) -> dict[str, A
     v = scale * row["v_poi_min_pu"]
     share = 1.0 - min(1.0, row["beta"] * v)
     margin = file.criteria.loss_share - share
-    return row | {"v_poi_min_pu": v, "loss_share": share, "loss_margin_share": margin, "loss_mw": row["p_mw"] * share,
-                  "loss_margin_mw": row["p_mw"] * margin}
+    return row | {
+        "v_poi_min_pu": v,
+        "loss_share": share,
+        "loss_margin_share": margin,
+        "loss_mw": row["p_mw"] * share,
+        "loss_margin_mw": row["p_mw"] * margin,
+    }
 
 
 def _note(store: Store, file: StudyFile, periods: dict[str, Any]) -> None:
-    store.note(study=file.canonical(), study_name=file.study.name, study_text=template(), quick=True,
-               versions={"dcvrt": "0.1.0", "python": "3.11"}, platform="test", engine="andes", seed=1, periods=periods,
-               criteria=phases.criteria(file), sites=list(SITES), sources={"load": "made up", "wind": "made up"},
-               network="ieee118", faults=[f.model_dump() for f in file.fault], backends={"gfl": "made up"}, wall_s=12.0)
+    store.note(
+        study=file.canonical(),
+        study_name=file.study.name,
+        study_text=template(),
+        quick=True,
+        versions={"dcvrt": "0.1.0", "python": "3.11"},
+        platform="test",
+        engine="andes",
+        seed=1,
+        periods=periods,
+        criteria=phases.criteria(file),
+        sites=list(SITES),
+        sources={"load": "made up", "wind": "made up"},
+        network="ieee118",
+        faults=[f.model_dump() for f in file.fault],
+        backends={"gfl": "made up"},
+        wall_s=12.0,
+    )
 
 
 def _lose(store: Store, file: StudyFile) -> None:
     store.add_tasks([("feed", "samples", '{"case":"ieee118","dynamics":null}')])
     store.set_task("feed", "timeout", "took longer than 600 s", 600.0)
-    request = {"faults": [f.model_dump() for f in file.fault], "sites": SITES, "hosting": CORNER,
-               "runs": [[m, b] for m in file.facility.modes for b in file.facility.beta],
-               "period": {"name": file.period[0].name}}
-    store.put("margins", [{"hosting": "s0000", **row} for row in replay.lost_rows(request, "timeout: 600 s", "task")])
+    request = {
+        "faults": [f.model_dump() for f in file.fault],
+        "sites": SITES,
+        "hosting": CORNER,
+        "runs": [[m, b] for m in file.facility.modes for b in file.facility.beta],
+        "period": {"name": file.period[0].name},
+    }
+    store.put(
+        "margins",
+        [{"hosting": "s0000", **row} for row in replay.lost_rows(request, "timeout: 600 s", "task")],
+    )
 
 
 def _plans(store: Store, file: StudyFile, failing: bool) -> None:
@@ -135,10 +213,16 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
                 shut = {}
                 for fit in fits:
                     if (fit["method"], fit["mode"]) == (method, mode) and fit["beta"] in (0.0, beta):
-                        margin = fit["intercept"] + sum(fit["slopes"][str(s)] * H for s, H in everything.items())
+                        margin = fit["intercept"] + sum(
+                            fit["slopes"][str(s)] * H for s, H in everything.items()
+                        )
                         if margin + fit["rating_slope"] * beta * everything[fit["site"]] < 0:
                             shut[fit["site"]] = f"{fit['target']} at bus {fit['site']}, fault {fit['fault']}"
-                plans.append(_plan(method, mode, beta, {s: 0.0 if s in shut else H for s, H in everything.items()}, shut))
+                plans.append(
+                    _plan(
+                        method, mode, beta, {s: 0.0 if s in shut else H for s, H in everything.items()}, shut
+                    )
+                )
     for plan in plans:
         by_site = {int(b): mw for b, mw in plan["by_site"].items()}
         store.put("hostings", [phases._hosting(plan["hosting"], "plan", "", by_site)])
@@ -146,19 +230,47 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
             store.put("plans", [plan])
             continue
         H = np.array([by_site[s] for s in SITES])
-        rows = [row for row in _rows(file, H, 0.96 if failing else 1.0) if (row["mode"], row["beta"]) == (plan["mode"], plan["beta"])]
+        rows = [
+            row
+            for row in _rows(file, H, 0.96 if failing else 1.0)
+            if (row["mode"], row["beta"]) == (plan["mode"], plan["beta"])
+        ]
         expected = int((H > 0).sum()) * len(file.period) * len(file.fault)
         store.put("margins", [{"hosting": plan["hosting"], **row} for row in rows])
         store.put("plans", [plan | replay.verdict(rows, by_site, expected) | {"replayed": 1}])
         _waveforms(store, file, plan, rows)
 
 
-def _plan(method: str, mode: str, beta: float, by_site: dict[int, float], shut: dict[int, str]) -> dict[str, Any]:
+def _plan(
+    method: str, mode: str, beta: float, by_site: dict[int, float], shut: dict[int, str]
+) -> dict[str, Any]:
     H = {str(s): mw for s, mw in by_site.items()}
-    binding = [{"kind": "line", "label": "80-99", "price": 0.52, "unit": "MW/MVA", "limit": 90.0, "hour": 17, "bus": None}]
-    return {"method": method, "mode": mode, "beta": beta, "hosting": phases._plan_name(H), "total_mw": sum(H.values()),
-            "by_site": H, "binding": binding, "closed": {str(s): why for s, why in shut.items()}, "carried_from": None,
-            "ac_passed": 1, "ac_v_min_pu": 0.9412, "ac_v_error_pu": 4e-5, "ac_status": "solved in every hour"}
+    binding = [
+        {
+            "kind": "line",
+            "label": "80-99",
+            "price": 0.52,
+            "unit": "MW/MVA",
+            "limit": 90.0,
+            "hour": 17,
+            "bus": None,
+        }
+    ]
+    return {
+        "method": method,
+        "mode": mode,
+        "beta": beta,
+        "hosting": phases._plan_name(H),
+        "total_mw": sum(H.values()),
+        "by_site": H,
+        "binding": binding,
+        "closed": {str(s): why for s, why in shut.items()},
+        "carried_from": None,
+        "ac_passed": 1,
+        "ac_v_min_pu": 0.9412,
+        "ac_v_error_pu": 4e-5,
+        "ac_status": "solved in every hour",
+    }
 
 
 def _waveforms(store: Store, file: StudyFile, plan: dict[str, Any], rows: list[dict[str, Any]]) -> None:
@@ -172,10 +284,31 @@ def _waveforms(store: Store, file: StudyFile, plan: dict[str, Any], rows: list[d
     for row in rows:
         if (row["period"], row["fault"]) == (worst["period"], worst["fault"]):
             v = np.where(dip, row["v_poi_min_pu"], 1.0 - 0.05 * np.exp(-(t - start) / 0.3) * (t >= start))
-            store.put_waveform({"t_s": t, "v_re_pu": v, "v_im_pu": 0 * t}, hosting=plan["hosting"], period=row["period"],
-                               fault=row["fault"], site=row["site"])
+            store.put_waveform(
+                {"t_s": t, "v_re_pu": v, "v_im_pu": 0 * t},
+                hosting=plan["hosting"],
+                period=row["period"],
+                fault=row["fault"],
+                site=row["site"],
+            )
     p = np.where(dip, 1.0 - worst["loss_share"], 1.0)
-    store.put_waveform({"t_s": t, "v_it_pu": 1.0 - 0.05 * dip, "p_g_pu": p, "q_g_pu": 0.2 * p, "i_g_pu": p, "p_b_pu": 1.0 - p,
-                        "soc_1": 0.8 + 0 * t, "w_dc_1": 1.0 - 0.1 * dip, "p_out_pu": 1.0 + 0 * t, "mode_1": 1.0 * dip},
-                       hosting=plan["hosting"], period=worst["period"], fault=worst["fault"], site=worst["site"],
-                       mode=plan["mode"], beta=plan["beta"])
+    store.put_waveform(
+        {
+            "t_s": t,
+            "v_it_pu": 1.0 - 0.05 * dip,
+            "p_g_pu": p,
+            "q_g_pu": 0.2 * p,
+            "i_g_pu": p,
+            "p_b_pu": 1.0 - p,
+            "soc_1": 0.8 + 0 * t,
+            "w_dc_1": 1.0 - 0.1 * dip,
+            "p_out_pu": 1.0 + 0 * t,
+            "mode_1": 1.0 * dip,
+        },
+        hosting=plan["hosting"],
+        period=worst["period"],
+        fault=worst["fault"],
+        site=worst["site"],
+        mode=plan["mode"],
+        beta=plan["beta"],
+    )

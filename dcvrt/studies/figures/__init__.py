@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TEST_BETA = 1.15
-"""Rating of the facility in the figure of the internal response; a study that has it in its list, or the nearest."""
+"""Rating of the facility in the figure of the internal response: the nearest of the study is taken."""
 
 
 def draw_all(folder: Path) -> list[Path]:
@@ -54,8 +54,16 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
     yield "validation", validation.draw(findings)
     yield "retained_voltage", faults.draw(findings)
     if findings.map_problem is None:
-        yield "network_map", network_map.draw(findings.network, findings.sites, findings.wind_buses,
-                                              [fault.bus for fault in findings.faults], findings.no_vrt_by_site)
+        yield (
+            "network_map",
+            network_map.draw(
+                findings.network,
+                findings.sites,
+                findings.wind_buses,
+                [fault.bus for fault in findings.faults],
+                findings.no_vrt_by_site,
+            ),
+        )
     for mode in findings.modes:
         case = findings.worst_case(mode)
         if case is not None:
@@ -73,7 +81,16 @@ def _internal_response(findings: Findings, mode: str) -> Figure:
     waveform = Waveform.ercot_style()
     dae = findings.facility(mode)
     beta = min(findings.study.facility.beta, key=lambda b: abs(b - TEST_BETA))
-    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf, **findings.parameters(mode))
-    title = f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; not ERCOT's official waveform)"
-    return ride.draw(ride.signals_of(run, waveform.at(run.t)), dae.automata[0].modes, title,
-                     findings.study.criteria.v_it_min_pu)
+    run = Simulator(dae, save_at=2e-3)(
+        waveform, beta=beta, pf=findings.study.hosting.pf, **findings.parameters(mode)
+    )
+    title = (
+        f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; "
+        "not ERCOT's official waveform)"
+    )
+    return ride.draw(
+        ride.signals_of(run, waveform.at(run.t)),
+        dae.automata[0].modes,
+        title,
+        findings.study.criteria.v_it_min_pu,
+    )

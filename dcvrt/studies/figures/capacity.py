@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 from dcvrt.studies.findings import Findings, Row, by_site, verdict
@@ -29,23 +30,35 @@ METHOD_TEXT = {"share": "share fit", "paper": "paper's fit"}
 
 
 def draw_totals(findings: Findings) -> Figure:
-    """Total capacity against beta, one panel a mode, one line a method; plans that failed the replay are crossed."""
+    """Total capacity against beta, a panel a mode, a line a method; failed plans are crossed out."""
     modes, methods = findings.modes, findings.methods
     figure = new_figure(PAGE, 2.75)
     panels = figure.subplots(1, len(modes), sharey=True, squeeze=False)[0]
     for axes, mode, letter in zip(panels, modes, letters(), strict=False):
-        axes.axhline(findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)), label="without ride-through")
+        axes.axhline(
+            findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)), label="without ride-through"
+        )
         for k, method in enumerate(methods):
             rows = findings.rows(mode, method)
             beta, total = [row["beta"] for row in rows], [row["total_mw"] for row in rows]
-            axes.plot(beta, total, color=mode_colour(mode, modes), linestyle=METHOD_LINES[k % len(METHOD_LINES)],
-                      marker=mode_marker(mode, modes), markerfacecolor=mode_colour(mode, modes) if k == 0 else "white",
-                      label=METHOD_TEXT.get(method, method), zorder=3 + k)
+            axes.plot(
+                beta,
+                total,
+                color=mode_colour(mode, modes),
+                linestyle=METHOD_LINES[k % len(METHOD_LINES)],
+                marker=mode_marker(mode, modes),
+                markerfacecolor=mode_colour(mode, modes) if k == 0 else "white",
+                label=METHOD_TEXT.get(method, method),
+                zorder=3 + k,
+            )
             cross_failed(axes, rows, [row["total_mw"] for row in rows])
         axes.set_xlabel("converter rating over capacity, β")
         panel(axes, letter, mode_name(mode))
     panels[0].set_ylabel("hosted capacity (MW)")
-    panels[0].set_ylim(-0.02 * findings.no_vrt_mw, 1.12 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]))
+    panels[0].set_ylim(
+        -0.02 * findings.no_vrt_mw,
+        1.12 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]),
+    )
     _legend(figure, panels[0], any(verdict(row) == "failed" for row in findings.rows()))
     return figure
 
@@ -64,9 +77,14 @@ def draw_allocation(findings: Findings) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("converter rating over capacity, β")
     panels[0, 0].set_ylim(0, 1.15 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]))
-    handles = [_patch(site_colour(site, sites), HATCHES[k % len(HATCHES)], f"bus {site}") for k, site in enumerate(sites)]
+    handles = [
+        _patch(site_colour(site, sites), HATCHES[k % len(HATCHES)], f"bus {site}")
+        for k, site in enumerate(sites)
+    ]
     extra = panels[0, 0].get_legend_handles_labels()[0]
-    figure.legend(handles=handles + extra, loc="outside lower center", ncols=min(6, len(handles) + len(extra)))
+    figure.legend(
+        handles=handles + extra, loc="outside lower center", ncols=min(6, len(handles) + len(extra))
+    )
     return figure
 
 
@@ -75,24 +93,51 @@ def cross_failed(axes: Axes, rows: list[Row], heights: list[float]) -> None:
     failed = [k for k, row in enumerate(rows) if verdict(row) == "failed"]
     if not failed:
         return
-    axes.plot([rows[k]["beta"] for k in failed], [heights[k] for k in failed], linestyle="none", marker="x", markersize=8,
-              markeredgewidth=1.7, color=FAILED, zorder=9)
+    axes.plot(
+        [rows[k]["beta"] for k in failed],
+        [heights[k] for k in failed],
+        linestyle="none",
+        marker="x",
+        markersize=8,
+        markeredgewidth=1.7,
+        color=FAILED,
+        zorder=9,
+    )
 
 
 def _stack(axes: Axes, findings: Findings, mode: str, method: str) -> None:
     rows, sites = findings.rows(mode, method), findings.sites
     beta = [float(row["beta"]) for row in rows]
-    width = 0.72 * min([b - a for a, b in zip(beta, beta[1:], strict=False)] or [0.05])
+    width = 0.72 * min([b - a for a, b in itertools.pairwise(beta)] or [0.05])
     floor = [0.0] * len(rows)
     for k, site in enumerate(sites):
         heights = [by_site(row, sites)[k] for row in rows]
-        axes.bar(beta, heights, width, bottom=floor, color=site_colour(site, sites), hatch=HATCHES[k % len(HATCHES)],
-                 edgecolor="white", linewidth=0.4)
+        axes.bar(
+            beta,
+            heights,
+            width,
+            bottom=floor,
+            color=site_colour(site, sites),
+            hatch=HATCHES[k % len(HATCHES)],
+            edgecolor="white",
+            linewidth=0.4,
+        )
         floor = [low + high for low, high in zip(floor, heights, strict=True)]
-    axes.axhline(findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)), label="without ride-through")
+    axes.axhline(
+        findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)), label="without ride-through"
+    )
     cross_failed(axes, rows, [top + 0.03 * findings.no_vrt_mw for top in floor])
     if any(verdict(row) == "failed" for row in findings.rows()):
-        axes.plot([], [], linestyle="none", marker="x", markersize=7, markeredgewidth=1.7, color=FAILED, label="failed the replay")
+        axes.plot(
+            [],
+            [],
+            linestyle="none",
+            marker="x",
+            markersize=7,
+            markeredgewidth=1.7,
+            color=FAILED,
+            label="failed the replay",
+        )
     axes.grid(axis="x", visible=False)
 
 
@@ -110,10 +155,29 @@ def _legend(figure: Figure, axes: Axes, failed: bool) -> None:
     for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
         plain = label == "without ride-through"
         colour = GREY if plain else INK
-        handles.append(Line2D([], [], color=colour, linestyle=handle.get_linestyle(), linewidth=handle.get_linewidth(),
-                              marker="" if plain else handle.get_marker(), label=label,
-                              markerfacecolor=INK if handle.get_markerfacecolor() != "white" else "white"))
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color=colour,
+                linestyle=handle.get_linestyle(),
+                linewidth=handle.get_linewidth(),
+                marker="" if plain else handle.get_marker(),
+                label=label,
+                markerfacecolor=INK if handle.get_markerfacecolor() != "white" else "white",
+            )
+        )
     if failed:
-        handles.append(Line2D([], [], linestyle="none", marker="x", markersize=7, markeredgewidth=1.7, color=FAILED,
-                              label="failed the replay"))
+        handles.append(
+            Line2D(
+                [],
+                [],
+                linestyle="none",
+                marker="x",
+                markersize=7,
+                markeredgewidth=1.7,
+                color=FAILED,
+                label="failed the replay",
+            )
+        )
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -50,22 +50,44 @@ def draw(findings: Findings) -> Figure:
         y = np.array([faults.index(fault) for fault in rows.fault]) + spread[k]
         colour = site_colour(site, sites)
         axes.hlines(y, rows["min"], rows["max"], color=colour, linewidth=1.6, alpha=0.75)
-        axes.plot(rows["median"], y, linestyle="none", marker=MARKERS[k % len(MARKERS)], color=colour, markersize=4.2,
-                  label=f"bus {site}")
+        axes.plot(
+            rows["median"],
+            y,
+            linestyle="none",
+            marker=MARKERS[k % len(MARKERS)],
+            color=colour,
+            markersize=4.2,
+            label=f"bus {site}",
+        )
     low, high = (float(table["min"].min()), float(table["max"].max())) if len(table) else (0.0, 1.0)
     axes.set_xlim(max(0.0, low - 0.04), high + 0.04)
     for beta in findings.study.facility.beta:
         voltage = rating_line(beta, findings.study.criteria.loss_share)
         if axes.get_xlim()[0] < voltage < axes.get_xlim()[1]:
             axes.axvline(voltage, color=GREY, linewidth=0.7, linestyle=(0, (3, 2)), zorder=1)
-            axes.annotate(f"β {beta:g}", (voltage, 1.0), (0, 2), xycoords=("data", "axes fraction"),
-                          textcoords="offset points", ha="center", fontsize=6.2, color=INK, rotation=60)
+            axes.annotate(
+                f"β {beta:g}",
+                (voltage, 1.0),
+                (0, 2),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                ha="center",
+                fontsize=6.2,
+                color=INK,
+                rotation=60,
+            )
     axes.set_yticks(range(len(faults)), faults)
     axes.set_ylim(len(faults) - 0.5, -0.5)
     axes.set_xlabel("lowest POI voltage during the fault (pu)")
     axes.set_ylabel("fault")
     axes.grid(axis="y", visible=False)
-    axes.plot([], [], color=GREY, linewidth=0.7, linestyle=(0, (3, 2)),
-              label="static limit of the load loss for a rating β")
+    axes.plot(
+        [],
+        [],
+        color=GREY,
+        linewidth=0.7,
+        linestyle=(0, (3, 2)),
+        label="static limit of the load loss for a rating β",
+    )
     figure.legend(loc="outside lower center", ncols=len(sites) + 1)
     return figure

@@ -42,10 +42,23 @@ def draw() -> Figure:
         _arrow(axes, (_X[3 - k], _Y[1] + middle), (_X[2 - k] + _WIDTH, _Y[1] + middle))
     _arrow(axes, (_X[3] + _WIDTH / 2, _Y[0]), (_X[3] + _WIDTH / 2, _Y[1] + _HEIGHT))
     _arrow(axes, (_X[0] + _WIDTH / 2, _Y[1] + _HEIGHT), (_X[0] + _WIDTH / 2, _Y[0]), dashed=True)
-    axes.text(_X[0] + _WIDTH / 2 + 0.08, (_Y[0] + _Y[1] + _HEIGHT) / 2, "each plan goes\nthrough the chain again",
-              fontsize=6.8, color=GREY, va="center")
-    axes.text(_X[3] + _WIDTH / 2 - 0.08, (_Y[0] + _Y[1] + _HEIGHT) / 2, "for each sample, period,\nfault, site, mode and β",
-              fontsize=6.8, color=GREY, va="center", ha="right")
+    axes.text(
+        _X[0] + _WIDTH / 2 + 0.08,
+        (_Y[0] + _Y[1] + _HEIGHT) / 2,
+        "each plan goes\nthrough the chain again",
+        fontsize=6.8,
+        color=GREY,
+        va="center",
+    )
+    axes.text(
+        _X[3] + _WIDTH / 2 - 0.08,
+        (_Y[0] + _Y[1] + _HEIGHT) / 2,
+        "for each sample, period,\nfault, site, mode and β",
+        fontsize=6.8,
+        color=GREY,
+        va="center",
+        ha="right",
+    )
     return figure
 
 
@@ -55,15 +68,45 @@ def _box(axes: Axes, corner: tuple[float, float], title: str, passes: str, note:
     from matplotlib.patches import FancyBboxPatch
 
     x, y = corner
-    axes.add_patch(FancyBboxPatch((x + 0.04, y + 0.04), _WIDTH - 0.08, _HEIGHT - 0.08, boxstyle="round,pad=0.04",
-                                  facecolor="white", edgecolor=colour, linewidth=1.4))
-    axes.text(x + _WIDTH / 2, y + _HEIGHT - 0.15, title, ha="center", va="center", fontsize=8.4, fontweight="bold")
+    axes.add_patch(
+        FancyBboxPatch(
+            (x + 0.04, y + 0.04),
+            _WIDTH - 0.08,
+            _HEIGHT - 0.08,
+            boxstyle="round,pad=0.04",
+            facecolor="white",
+            edgecolor=colour,
+            linewidth=1.4,
+        )
+    )
+    axes.text(
+        x + _WIDTH / 2, y + _HEIGHT - 0.15, title, ha="center", va="center", fontsize=8.4, fontweight="bold"
+    )
     axes.text(x + _WIDTH / 2, y + _HEIGHT - 0.34, passes, ha="center", va="center", fontsize=6.8)
-    axes.text(x + _WIDTH / 2, y + 0.25, "\n".join(textwrap.wrap(note, 27, break_on_hyphens=False)), ha="center", va="center", fontsize=6.4,
-              color=GREY, linespacing=1.15)
+    axes.text(
+        x + _WIDTH / 2,
+        y + 0.25,
+        "\n".join(textwrap.wrap(note, 27, break_on_hyphens=False)),
+        ha="center",
+        va="center",
+        fontsize=6.4,
+        color=GREY,
+        linespacing=1.15,
+    )
 
 
 def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], dashed: bool = False) -> None:
-    axes.annotate("", end, start, arrowprops=dict(
-        arrowstyle="-|>", color=GREY if dashed else INK, linewidth=1.0, shrinkA=1, shrinkB=1,
-        linestyle=(0, (4, 2)) if dashed else "-", mutation_scale=9))
+    axes.annotate(
+        "",
+        end,
+        start,
+        arrowprops=dict(
+            arrowstyle="-|>",
+            color=GREY if dashed else INK,
+            linewidth=1.0,
+            shrinkA=1,
+            shrinkB=1,
+            linestyle=(0, (4, 2)) if dashed else "-",
+            mutation_scale=9,
+        ),
+    )

@@ -4,9 +4,10 @@ Minimises the stress
 
 .. math:: \sum_{i<j} d_{ij}^{-2} \left( \lVert x_i - x_j \rVert - d_{ij} \right)^2
 
-over positions x, where d_ij is a power of the number of branches between two buses. Each step replaces x by the
-minimum of a quadratic that lies above the stress and touches it at x (the Guttman transform), so the stress never
-rises. It starts from classical scaling and draws no random number: the same network gives the same picture.
+over positions x, where d_ij is a power of the number of branches between two buses. Each step replaces x by
+the minimum of a quadratic that lies above the stress and touches it at x (the Guttman transform), so the
+stress never rises. It starts from classical scaling and draws no random number: the same network gives the
+same picture.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def positions(network: Network) -> Floats:
     """
     table = importlib.resources.files("dcvrt") / "data" / "layout" / f"{network.name}.csv"
     if table.is_file():
-        rows = list(csv.DictReader(line for line in table.read_text(encoding="utf-8").splitlines() if line[:1] != "#"))
+        rows = list(
+            csv.DictReader(line for line in table.read_text(encoding="utf-8").splitlines() if line[:1] != "#")
+        )
         places = {int(row["bus"]): (float(row["x"]), float(row["y"])) for row in rows}
         if places.keys() == {int(bus) for bus in network.bus}:
             return np.array([places[int(bus)] for bus in network.bus])
@@ -76,7 +79,9 @@ def majorised(distance: Floats, x: Floats, steps: int) -> Floats:
     n = len(x)
     weight = np.where(np.eye(n, dtype=bool), 0.0, 1.0 / np.maximum(distance, 1e-9) ** 2)
     laplacian = np.diag(weight.sum(axis=1)) - weight
-    inverse = np.linalg.inv(laplacian + 1.0 / n)  # the constant vector is its kernel; the added part leaves the rest alone
+    inverse = np.linalg.inv(
+        laplacian + 1.0 / n
+    )  # the constant vector is its kernel; the added part leaves the rest alone
     for _ in range(steps):
         drawn = np.linalg.norm(x[:, None] - x[None], axis=2)
         ratio = weight * distance / np.where(drawn > 1e-9, drawn, np.inf)
@@ -94,7 +99,10 @@ def upright(x: Floats) -> Floats:
 
 def write_table(network: Network, path: str) -> None:
     """Write the coordinates of a network in the form that `positions` reads."""
-    lines = ["# bus coordinates by dcvrt.studies.figures.layout.computed, no geography; see SOURCE.md", "bus,x,y"]
+    lines = [
+        "# bus coordinates by dcvrt.studies.figures.layout.computed, no geography; see SOURCE.md",
+        "bus,x,y",
+    ]
     lines += [f"{bus},{x:.3f},{y:.3f}" for bus, (x, y) in zip(network.bus, computed(network), strict=True)]
     with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")

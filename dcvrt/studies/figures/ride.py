@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -30,21 +31,28 @@ def draw(signals: Signals, modes: Sequence[str], title: str, v_it_min: float | N
     """
     figure = new_figure(PAGE, 4.9)
     figure.suptitle(title, x=0.01, ha="left", fontsize=8.5)
-    volts, powers, reactive = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": [1.1, 1.2, 0.8]})
+    volts, powers, reactive = figure.subplots(
+        3, 1, sharex=True, gridspec_kw={"height_ratios": [1.1, 1.2, 0.8]}
+    )
     t = np.asarray(signals["t_s"], dtype=float)
     name = letters()
 
     volts.plot(t, signals["v_poi"], color=INK, linestyle=(0, (4, 1.5)), label="POI voltage, imposed")
     volts.plot(t, signals["v_it"], color=PALETTE[0], label="protected IT voltage")
     if v_it_min is not None:
-        volts.axhline(v_it_min, color=GREY, linewidth=0.9, linestyle=(0, (1, 1.5)), label="required of the IT voltage")
+        volts.axhline(
+            v_it_min, color=GREY, linewidth=0.9, linestyle=(0, (1, 1.5)), label="required of the IT voltage"
+        )
     volts.set_ylabel("voltage (pu)")
     volts.set_ylim(bottom=0.0)
     panel(volts, next(name), "voltages")
 
-    for key, label, colour, line in (("p_g", "import at the POI", INK, "-"), ("p_b", "battery", PALETTE[1], "-"),
-                                     ("p_it", "IT demand", PALETTE[0], (0, (4, 1.5))),
-                                     ("p_cool", "cooling demand", PALETTE[2], (0, (1, 1.2)))):
+    for key, label, colour, line in (
+        ("p_g", "import at the POI", INK, "-"),
+        ("p_b", "battery", PALETTE[1], "-"),
+        ("p_it", "IT demand", PALETTE[0], (0, (4, 1.5))),
+        ("p_cool", "cooling demand", PALETTE[2], (0, (1, 1.2))),
+    ):
         powers.plot(t, signals[key], color=colour, linestyle=line, label=label)
     powers.set_ylabel("active power (pu of H)")
     panel(powers, next(name), "active power")
@@ -72,7 +80,7 @@ def shade_modes(axes: Axes, t: Any, number: Any, modes: Sequence[str]) -> None:
     """Shade the spans of time that the supervisor spent in each mode."""
     held = np.round(np.asarray(number, dtype=float)).astype(int)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(held)) + 1, [len(held)]])
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         end = t[b] if b < len(t) else t[-1]
         axes.axvspan(t[a], end, facecolor=mode_band(modes[held[a]], modes), edgecolor="none", zorder=0)
 
@@ -81,6 +89,15 @@ def _mode_key(figure: Figure, modes: Sequence[str], number: Any) -> None:
     from matplotlib.patches import Patch
 
     visited = set(np.round(np.asarray(number, dtype=float)).astype(int).tolist())
-    handles = [Patch(facecolor=mode_band(mode, modes), edgecolor=GREY, linewidth=0.6, label=mode)
-               for k, mode in enumerate(modes) if k in visited]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), title="supervisor mode", title_fontsize=7.5)
+    handles = [
+        Patch(facecolor=mode_band(mode, modes), edgecolor=GREY, linewidth=0.6, label=mode)
+        for k, mode in enumerate(modes)
+        if k in visited
+    ]
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=len(handles),
+        title="supervisor mode",
+        title_fontsize=7.5,
+    )

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 _BOX = (1.25, 0.62)
 _HEIGHT = 3.1
-_KEY = ("Numbers: order in which transitions are tried.  'for': the guard must hold that long without a break.  "
-        "Bold frame: start.  $v_f$: measured POI voltage.  $w$: DC energy over nominal.")
+_KEY = (
+    "Numbers: order in which transitions are tried.  'for': the guard must hold that long without a break.  "
+    "Bold frame: start.  $v_f$: measured POI voltage.  $w$: DC energy over nominal."
+)
 
 
 def draw(dae: Dae, automaton: str | None = None) -> Figure:
@@ -46,8 +48,15 @@ def draw(dae: Dae, automaton: str | None = None) -> Figure:
         ends = places[table.modes.index(source)], places[table.modes.index(target)]
         _edge(axes, *ends, "\n".join(texts), paired=(target, source) in lines)
     for k in range(0, len(values), 6):
-        axes.text(PAGE / 2, -0.02 - 0.15 * (k // 6), "     ".join(values[k : k + 6]), ha="center", va="center",
-                  fontsize=6.8, color=INK)
+        axes.text(
+            PAGE / 2,
+            -0.02 - 0.15 * (k // 6),
+            "     ".join(values[k : k + 6]),
+            ha="center",
+            va="center",
+            fontsize=6.8,
+            color=INK,
+        )
     axes.text(PAGE / 2, bottom + 0.10, _KEY, ha="center", va="center", fontsize=6.5, color=GREY)
     return figure
 
@@ -78,20 +87,33 @@ def _merged(comparisons: Sequence[str]) -> list[str]:
     for k, (signal, side, limit) in enumerate(parts):
         if k in used:
             continue
-        other = next((j for j in range(k + 1, len(parts)) if parts[j][0] == signal and parts[j][1] != side), None)
+        other = next(
+            (j for j in range(k + 1, len(parts)) if parts[j][0] == signal and parts[j][1] != side), None
+        )
         if other is None:
             merged.append(f"{signal} {side} {limit}")
             continue
         used.add(other)
         low, high = (limit, parts[other][2]) if side == ">" else (parts[other][2], limit)
-        merged.append(f"|{signal}| < {high}" if low in (f"(-{high})", f"-{high}") else f"{low} < {signal} < {high}")
+        merged.append(
+            f"|{signal}| < {high}" if low in (f"(-{high})", f"-{high}") else f"{low} < {signal} < {high}"
+        )
     return merged
 
 
 def _symbols(text: str) -> str:
     """Names with an underscore, and single letters, in mathematical type."""
-    return re.sub(r"\b([A-Za-z]+)_([A-Za-z0-9]+)\b|\b([A-Za-z])\b",
-                  lambda m: f"${m[3]}$" if m[3] else f"${m[1]}_{{\\mathrm{{{m[2]}}}}}$" if len(m[2]) > 1 else f"${m[1]}_{m[2]}$", text)
+    return re.sub(
+        r"\b([A-Za-z]+)_([A-Za-z0-9]+)\b|\b([A-Za-z])\b",
+        lambda m: (
+            f"${m[3]}$"
+            if m[3]
+            else f"${m[1]}_{{\\mathrm{{{m[2]}}}}}$"
+            if len(m[2]) > 1
+            else f"${m[1]}_{m[2]}$"
+        ),
+        text,
+    )
 
 
 def _values(dae: Dae, table: Automaton) -> list[str]:
@@ -116,21 +138,38 @@ def _set_flags(table: Automaton, mode: str) -> str:
 
 def _places(n: int) -> list[tuple[float, float]]:
     """Centres of the boxes: the corners of a wide rectangle for four modes, an ellipse for other numbers."""
-    left, right, low, high = 0.10 + _BOX[0] / 2, PAGE - 0.10 - _BOX[0] / 2, 0.26 + _BOX[1] / 2, _HEIGHT - 0.27 - _BOX[1] / 2
+    left, right, low, high = (
+        0.10 + _BOX[0] / 2,
+        PAGE - 0.10 - _BOX[0] / 2,
+        0.26 + _BOX[1] / 2,
+        _HEIGHT - 0.27 - _BOX[1] / 2,
+    )
     if n == 4:
         return [(left, high), (right, high), (right, low), (left, low)]
     turns = [math.pi * (0.75 - 2 * k / n) for k in range(n)]
     middle = ((left + right) / 2, (low + high) / 2)
-    return [(middle[0] + (right - left) / 2 * math.cos(a), middle[1] + (high - low) / 2 * math.sin(a)) for a in turns]
+    return [
+        (middle[0] + (right - left) / 2 * math.cos(a), middle[1] + (high - low) / 2 * math.sin(a))
+        for a in turns
+    ]
 
 
 def _box(axes: Axes, mode: str, note: str, centre: tuple[float, float], shade: str, start: bool) -> None:
     from matplotlib.patches import FancyBboxPatch
 
     x, y = centre
-    axes.add_patch(FancyBboxPatch((x - _BOX[0] / 2 + 0.05, y - _BOX[1] / 2 + 0.05), _BOX[0] - 0.1, _BOX[1] - 0.1,
-                                  boxstyle="round,pad=0.05", facecolor=shade, edgecolor=INK,
-                                  linewidth=1.8 if start else 0.9, zorder=3))
+    axes.add_patch(
+        FancyBboxPatch(
+            (x - _BOX[0] / 2 + 0.05, y - _BOX[1] / 2 + 0.05),
+            _BOX[0] - 0.1,
+            _BOX[1] - 0.1,
+            boxstyle="round,pad=0.05",
+            facecolor=shade,
+            edgecolor=INK,
+            linewidth=1.8 if start else 0.9,
+            zorder=3,
+        )
+    )
     axes.text(x, y + 0.10, mode, ha="center", va="center", fontsize=9, fontweight="bold", zorder=4)
     axes.text(x, y - 0.13, note, ha="center", va="center", fontsize=6.3, zorder=4)
 
@@ -142,18 +181,48 @@ def _edge(axes: Axes, start: tuple[float, float], end: tuple[float, float], text
     side = (-dy / length, dx / length)  # to the left of the direction of travel
     lane = 0.11 if paired else 0.0
     shift = (side[0] * lane, side[1] * lane)
-    reach = [min(_BOX[0] / 2 / abs(dx / length) if dx else math.inf, _BOX[1] / 2 / abs(dy / length) if dy else math.inf)] * 2
+    reach = [
+        min(
+            _BOX[0] / 2 / abs(dx / length) if dx else math.inf,
+            _BOX[1] / 2 / abs(dy / length) if dy else math.inf,
+        )
+    ] * 2
     a = (start[0] + dx / length * reach[0] + shift[0], start[1] + dy / length * reach[0] + shift[1])
     b = (end[0] - dx / length * reach[1] + shift[0], end[1] - dy / length * reach[1] + shift[1])
-    axes.annotate("", b, a, arrowprops=dict(arrowstyle="-|>", color=INK, linewidth=1.1, shrinkA=0, shrinkB=1, mutation_scale=10))
+    axes.annotate(
+        "",
+        b,
+        a,
+        arrowprops=dict(arrowstyle="-|>", color=INK, linewidth=1.1, shrinkA=0, shrinkB=1, mutation_scale=10),
+    )
     middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
     style = dict(fontsize=7.2, linespacing=1.45, zorder=5)
     if abs(dy) < 1e-9:  # along a side of the rectangle: above the upper lane, below the lower one
         above = shift[1] > 0 or (lane == 0 and start[1] < _HEIGHT / 2)
-        axes.text(middle[0], middle[1] + (0.06 if above else -0.06), text, ha="center", va="bottom" if above else "top", **style)
+        axes.text(
+            middle[0],
+            middle[1] + (0.06 if above else -0.06),
+            text,
+            ha="center",
+            va="bottom" if above else "top",
+            **style,
+        )
     elif abs(dx) < 1e-9:  # up or down: towards the middle of the figure, where there is room
         inner = -1 if middle[0] > PAGE / 2 else 1
-        axes.text(middle[0] + inner * 0.10, middle[1], text, ha="right" if inner < 0 else "left", va="center", **style)
+        axes.text(
+            middle[0] + inner * 0.10,
+            middle[1],
+            text,
+            ha="right" if inner < 0 else "left",
+            va="center",
+            **style,
+        )
     else:
-        axes.text(*middle, text, ha="center", va="center",
-                  bbox=dict(facecolor="white", edgecolor="none", pad=1.5, alpha=0.9), **style)
+        axes.text(
+            *middle,
+            text,
+            ha="center",
+            va="center",
+            bbox=dict(facecolor="white", edgecolor="none", pad=1.5, alpha=0.9),
+            **style,
+        )

@@ -1,4 +1,4 @@
-"""Waveforms of the worst replayed case of a mode: the voltages that the grid gave, and what the facility made of them."""
+"""Waveforms of the worst replayed case of a mode: voltages of the grid, and what the facility made of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,18 @@ import numpy as np
 from dcvrt.studies.figures.faults import fault_name
 from dcvrt.studies.figures.ride import shade_modes
 from dcvrt.studies.findings import Case, Findings
-from dcvrt.studies.style import GREY, INK, PAGE, PALETTE, letters, mode_band, mode_name, new_figure, panel, site_colour
+from dcvrt.studies.style import (
+    GREY,
+    INK,
+    PAGE,
+    PALETTE,
+    letters,
+    mode_band,
+    mode_name,
+    new_figure,
+    panel,
+    site_colour,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,11 +30,21 @@ SITE_LINES = ("-", (0, (5, 1.5)), (0, (3, 1.2, 1, 1.2)), (0, (1, 1)))
 
 
 def draw(findings: Findings, case: Case) -> Figure:
-    """POI voltage at every site above; voltages, powers and DC energy of the facility at the worst site below."""
-    grid = {key["site"]: signals for key, signals in
-            findings.waveforms(hosting=case.hosting, period=case.period, fault=case.fault, mode="")}
-    found = findings.waveforms(hosting=case.hosting, period=case.period, fault=case.fault, site=case.site, mode=case.mode,
-                               beta=case.beta)
+    """POI voltage at every site above; voltages, powers and DC energy of the worst facility below."""
+    grid = {
+        key["site"]: signals
+        for key, signals in findings.waveforms(
+            hosting=case.hosting, period=case.period, fault=case.fault, mode=""
+        )
+    }
+    found = findings.waveforms(
+        hosting=case.hosting,
+        period=case.period,
+        fault=case.fault,
+        site=case.site,
+        mode=case.mode,
+        beta=case.beta,
+    )
     signals = found[0][1] if found else {}
     figure = new_figure(PAGE, 5.2 if signals else 2.4)
     panels = figure.subplots(3 if signals else 1, 1, sharex=True, squeeze=False)[:, 0]
@@ -32,8 +53,13 @@ def draw(findings: Findings, case: Case) -> Figure:
     for k, site in enumerate(findings.sites):
         if site in grid:
             wave = grid[site]
-            volts.plot(wave["t_s"], np.hypot(wave["v_re_pu"], wave["v_im_pu"]), color=site_colour(site, findings.sites),
-                       linestyle=SITE_LINES[k % len(SITE_LINES)], label=f"bus {site}" + (" (worst)" if site == case.site else ""))
+            volts.plot(
+                wave["t_s"],
+                np.hypot(wave["v_re_pu"], wave["v_im_pu"]),
+                color=site_colour(site, findings.sites),
+                linestyle=SITE_LINES[k % len(SITE_LINES)],
+                label=f"bus {site}" + (" (worst)" if site == case.site else ""),
+            )
     volts.set_ylabel("voltage (pu)")
     volts.set_ylim(bottom=0.0)
     panel(volts, next(name), f"POI voltage at each site, fault {case.fault}, period {case.period}")
@@ -56,10 +82,19 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
     modes = findings.facility(case.mode).automata[0].modes
     inside.plot(t, signals["v_it_pu"], color=PALETTE[0], label="protected IT voltage")
     inside.plot(t, signals["w_dc_1"], color=PALETTE[4], linestyle=(0, (4, 1.5)), label="DC energy / nominal")
-    inside.axhline(findings.study.criteria.v_it_min_pu, color=GREY, linewidth=0.9, linestyle=(0, (1, 1.5)),
-                   label="required of the IT voltage")
+    inside.axhline(
+        findings.study.criteria.v_it_min_pu,
+        color=GREY,
+        linewidth=0.9,
+        linestyle=(0, (1, 1.5)),
+        label="required of the IT voltage",
+    )
     inside.set_ylabel("(pu)")
-    panel(inside, next(name), f"{mode_name(case.mode)}, β = {case.beta:g}, at bus {case.site}: voltage and DC energy")
+    panel(
+        inside,
+        next(name),
+        f"{mode_name(case.mode)}, β = {case.beta:g}, at bus {case.site}: voltage and DC energy",
+    )
     powers.plot(t, signals["p_out_pu"], color=PALETTE[2], linestyle=(0, (1, 1.2)), label="facility load")
     powers.plot(t, signals["p_g_pu"], color=INK, label="import at the POI")
     powers.plot(t, signals["p_b_pu"], color=PALETTE[1], label="battery")
@@ -71,12 +106,22 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
     for axes in panels:
         shade_modes(axes, np.asarray(t), signals["mode_1"], modes)
     visited = sorted(set(np.round(np.asarray(signals["mode_1"], dtype=float)).astype(int).tolist()))
-    handles = [Patch(facecolor=mode_band(modes[k], modes), edgecolor=GREY, linewidth=0.6, label=modes[k]) for k in visited]
-    powers.figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), title="supervisor mode",
-                         title_fontsize=7.5)
+    handles = [
+        Patch(facecolor=mode_band(modes[k], modes), edgecolor=GREY, linewidth=0.6, label=modes[k])
+        for k in visited
+    ]
+    powers.figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=len(handles),
+        title="supervisor mode",
+        title_fontsize=7.5,
+    )
 
 
-def _window(findings: Findings, case: Case, grid: Mapping[int, Mapping[str, Any]], signals: Mapping[str, Any]) -> tuple[float, float]:
+def _window(
+    findings: Findings, case: Case, grid: Mapping[int, Mapping[str, Any]], signals: Mapping[str, Any]
+) -> tuple[float, float]:
     """Time from shortly before the fault to when the supervisor has settled, or the end of the record."""
     ends = [float(s["t_s"][-1]) for s in [*grid.values(), *([signals] if signals else [])]]
     end = max(ends, default=1.0)

@@ -47,46 +47,63 @@ def section(title: str, *parts: Safe, name: str = "") -> Safe:
     """A section with a heading and an anchor."""
     anchor = name or re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
     body = "\n".join(part for part in parts if part)
-    return Safe(f'<section id="{anchor}" aria-labelledby="{anchor}-title">\n<h2 id="{anchor}-title">{escape(title)}</h2>\n'
-                f"{body}\n</section>")
+    return Safe(
+        f'<section id="{anchor}" aria-labelledby="{anchor}-title">\n<h2 '
+        f'id="{anchor}-title">{escape(title)}</h2>\n'
+        f"{body}\n</section>"
+    )
 
 
 def notice(title: str, body: Safe, kind: str = "warning") -> Safe:
     """A box that must not be overlooked. `kind` is warning, good or neutral."""
-    return Safe(f'<div class="notice {kind}" role="note"><p class="notice-title">{escape(title)}</p>{body}</div>')
+    return Safe(
+        f'<div class="notice {kind}" role="note"><p class="notice-title">{escape(title)}</p>{body}</div>'
+    )
 
 
 def badge(verdict: str) -> Safe:
     """A verdict as a coloured word; the word alone already tells it."""
     kind = {"passed": "good", "failed": "bad"}.get(verdict, "plain")
-    return Safe(f'<span class="badge {kind}">{escape(verdict.upper() if verdict == "failed" else verdict)}</span>')
+    return Safe(
+        f'<span class="badge {kind}">{escape(verdict.upper() if verdict == "failed" else verdict)}</span>'
+    )
 
 
-def table(caption: str, head: Sequence[object], rows: Sequence[Sequence[object]], words: Sequence[int] = (),
-          marked: Sequence[int] = ()) -> Safe:
-    """A table with a caption, column headers and a header in each row, in a box that scrolls on narrow screens.
+def table(
+    caption: str,
+    head: Sequence[object],
+    rows: Sequence[Sequence[object]],
+    words: Sequence[int] = (),
+    marked: Sequence[int] = (),
+) -> Safe:
+    """A table with a caption, column headers and row headers, in a box that scrolls on narrow screens.
 
     Parameters
     ----------
     caption : what the table shows.
     head : column headers.
     rows : cells; the first of each is its header.
-    words : columns (from 0) that hold text; all others are aligned as numbers. The first column is always text.
+    words : columns (from 0) that hold text, beside the first; all others are aligned as numbers.
     marked : rows (from 0) that stand out.
     """
     if not rows:
         return paragraph(f"{caption}: none.")
     kinds = ["text" if k == 0 or k in words else "number" for k in range(len(head))]
-    top = "".join(f'<th scope="col" class="{kind}">{escape(text)}</th>' for kind, text in zip(kinds, head, strict=True))
+    top = "".join(
+        f'<th scope="col" class="{kind}">{escape(text)}</th>' for kind, text in zip(kinds, head, strict=True)
+    )
     lines = []
     for n, row in enumerate(rows):
         first, *rest = zip(kinds, row, strict=True)
         cells = f'<th scope="row" class="{first[0]}">{escape(first[1])}</th>'
         cells += "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in rest)
         lines.append(f'<tr class="marked">{cells}</tr>' if n in marked else f"<tr>{cells}</tr>")
-    return Safe(f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
-                f"<caption>{escape(caption)}</caption><thead><tr>{top}</tr></thead>\n<tbody>\n" + "\n".join(lines)
-                + "\n</tbody></table></div>")
+    return Safe(
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
+        f"<caption>{escape(caption)}</caption><thead><tr>{top}</tr></thead>\n<tbody>\n"
+        + "\n".join(lines)
+        + "\n</tbody></table></div>"
+    )
 
 
 def figure(svg: Path, alt: str, caption: str) -> Safe:
@@ -96,16 +113,20 @@ def figure(svg: Path, alt: str, caption: str) -> Safe:
 
 
 def inline(svg: str, prefix: str, alt: str) -> Safe:
-    """An SVG file as an element of a page: no prolog, no fixed size, ids of its own, and a text for those who hear it.
+    """An SVG file as an element of a page: no prolog, no fixed size, ids of its own, and a text to hear.
 
-    >>> inline('<?xml version="1.0"?><svg width="9pt" height="9pt" viewBox="0 0 9 9"><g id="a"/></svg>', "f", "nothing")
+    >>> inline('<?xml version="1.0"?><svg width="9pt" viewBox="0 0 9 9"><g id="a"/></svg>', "f", "nothing")
     '<svg role="img" aria-label="nothing" viewBox="0 0 9 9"><g id="f-a"/></svg>'
     """
-    body = svg[svg.index("<svg"):]
+    body = svg[svg.index("<svg") :]
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     opening, rest = body.split(">", 1)
     opening = re.sub(r'\s(?:width|height)="[^"]*"', "", opening)
-    body = opening.replace("<svg", f'<svg role="img" aria-label="{html.escape(alt, quote=True)}"', 1) + ">" + rest
+    body = (
+        opening.replace("<svg", f'<svg role="img" aria-label="{html.escape(alt, quote=True)}"', 1)
+        + ">"
+        + rest
+    )
     body = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', body)
     body = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', body)
     body = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", body)
@@ -114,4 +135,8 @@ def inline(svg: str, prefix: str, alt: str) -> Safe:
 
 def definitions(pairs: Sequence[tuple[object, object]]) -> Safe:
     """A list of terms and what they are."""
-    return Safe("<dl>" + "".join(f"<div><dt>{escape(term)}</dt><dd>{escape(text)}</dd></div>" for term, text in pairs) + "</dl>")
+    return Safe(
+        "<dl>"
+        + "".join(f"<div><dt>{escape(term)}</dt><dd>{escape(text)}</dd></div>" for term, text in pairs)
+        + "</dl>"
+    )

@@ -1,4 +1,4 @@
-"""The report of a study: one HTML file that opens anywhere, without a network, and says first what was asked."""
+"""The report of a study: one HTML file that opens anywhere, without a network, with the answer first."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from importlib import resources
 from pathlib import Path
 from string import Template
 
-from dcvrt.studies import report_back, report_front
+from dcvrt.studies.report import answer, checks, grid, models, plans, record
+from dcvrt.studies.report.page import Safe, escape
+
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
-from dcvrt.studies.page import Safe, escape
 
 REPORT = "report.html"
 
 SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
-    report_front.answer,
-    report_front.plans,
-    report_front.failures,
-    report_front.closed_sites,
-    report_front.validation,
-    report_front.worst_cases,
-    report_back.grid,
-    report_back.facility,
-    report_back.simulations,
-    report_back.assumptions,
-    report_back.deviations,
-    report_back.method,
-    report_back.provenance,
+    answer.answer,
+    plans.plans,
+    plans.failures,
+    plans.closed_sites,
+    checks.validation,
+    checks.worst_cases,
+    grid.grid,
+    models.facility,
+    record.simulations,
+    models.assumptions,
+    models.deviations,
+    record.method,
+    record.provenance,
 )
 
 
@@ -62,11 +63,23 @@ def text_of(findings: Findings) -> str:
     titles = re.findall(r'<section id="([^"]+)".*?<h2[^>]*>(.*?)</h2>', body, flags=re.DOTALL)
     contents = "".join(f'<li><a href="#{anchor}">{title}</a></li>' for anchor, title in titles)
     versions = findings.summary["versions"]
-    kind = "A quick run: fewer samples, periods and ratings than the study file asks for. " if findings.provenance["quick"] else ""
-    page = Template(resources.files("dcvrt.studies").joinpath("report.html").read_text(encoding="utf-8"))
+    kind = (
+        "A quick run: fewer samples, periods and ratings than the study file asks for. "
+        if findings.provenance["quick"]
+        else ""
+    )
+    page = Template(resources.files("dcvrt.studies.report").joinpath("page.html").read_text(encoding="utf-8"))
     return page.substitute(
         title=escape(findings.study.study.name),
-        subtitle=escape(f"{kind}How much data-centre load the grid can host when every site must ride through the grid's faults."),
-        contents=contents, body=body,
-        footer=escape(f"Made by dcvrt {versions['dcvrt']} from the store of the study. Screening results in positive sequence; "
-                      "not a submission to a system operator."))
+        subtitle=escape(
+            f"{kind}How much data-centre load the grid can host when every site must ride through the "
+            "grid's faults."
+        ),
+        contents=contents,
+        body=body,
+        footer=escape(
+            f"Made by dcvrt {versions['dcvrt']} from the store of the study. Screening results in positive "
+            "sequence; "
+            "not a submission to a system operator."
+        ),
+    )

@@ -1,0 +1,101 @@
+"""How good the fitted margins are, and the worst of the replayed cases."""
+
+from __future__ import annotations
+
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.report.answer import TARGETS, false_passes
+from dcvrt.studies.report.page import Safe, figure, number, paragraph, section, table
+from dcvrt.studies.style import mode_name
+
+
+def validation(findings: Findings) -> Safe:
+    """How well the fitted margins foretell simulations that they have not seen."""
+    false = false_passes(findings)
+    fits = findings.surrogates
+    rows = []
+    marked = []
+    for k, score in enumerate(findings.summary["surrogate"]):
+        key = (score["method"], score["mode"], score["target"])
+        own = fits[(fits.method == key[0]) & (fits["mode"] == key[1]) & (fits.target == key[2])]
+        unit = "pu" if key[2] == "voltage" else "MW" if key[0] == "paper" else "share"
+        digits = 3 if unit == "MW" else 5
+        rows.append(
+            [
+                key[0],
+                mode_name(key[1]),
+                TARGETS[key[2]],
+                unit,
+                *[number(score[name], digits) for name in ("mae", "rmse", "worst_over", "worst_under")],
+                str(false[key]),
+                number(100.0 * score["violation_rate"], 2, "–"),
+                str(score["n_fit"]),
+                str(score["n_validation"]),
+                str(int(own.n_excluded.sum())),
+                str(int((own.n_sequences > 1).sum())),
+            ]
+        )
+        if false[key]:
+            marked.append(k)
+    head = [
+        "method",
+        "mode",
+        "margin",
+        "unit",
+        "mean absolute error",
+        "root mean square error",
+        "worst overprediction",
+        "worst underprediction",
+        "false passes",
+        "conservative violations (%)",
+        "points fitted",
+        "validation points",
+        "failed runs left out",
+        "fits over mixed event sequences",
+    ]
+    return section(
+        "How good the fitted margins are",
+        paragraph(
+            "Each margin is fitted on some of the samples, lowered by its largest overprediction there, and "
+            "judged on samples that the "
+            "fit has not seen. A conservative violation is a prediction above the simulated margin; a false "
+            "pass is one that also "
+            "passes a point that truly fails. Errors of the two methods have different units."
+        ),
+        table("Validation of the surrogates after tightening", head, rows, words=[1, 2, 3], marked=marked),
+        figure(
+            findings.folder / "figures" / "validation.svg",
+            alt=_validation_alt(findings, false),
+            caption="Simulated against predicted margins after tightening. Points above the line are "
+            "overpredictions; the shaded "
+            "quadrant holds false passes, ringed in red.",
+        ),
+    )
+
+
+def _validation_alt(findings: Findings, false: dict[tuple[str, str, str], int]) -> str:
+    return "Scatter of simulated against predicted margins. " + " ".join(
+        f"Method {method}, {mode_name(mode)}, {TARGETS[target]}: {count} false passes."
+        for (method, mode, target), count in false.items()
+    )
+
+
+def worst_cases(findings: Findings) -> Safe:
+    """Waveforms of the replayed run with the least margin, for each mode."""
+    parts: list[Safe] = []
+    for mode in findings.modes:
+        case = findings.worst_case(mode)
+        picture = findings.folder / "figures" / f"worst_case_{mode}.svg"
+        if case is None or not picture.is_file():
+            parts.append(paragraph(f"{mode_name(mode)}: no plan with capacity was replayed."))
+            continue
+        passed = case.v_margin_pu >= 0 and case.loss_margin_share >= 0
+        path = case.sequence.replace(">", " → ") or "not recorded"
+        text = (
+            f"{mode_name(mode)}, β = {case.beta:g}, {case.h_mw:.1f} MW at bus {case.site}; fault "
+            f"{case.fault}, period {case.period}. "
+            f"Voltage margin {number(case.v_margin_pu, 4)} pu, loss margin "
+            f"{number(100 * case.loss_margin_share, 2)} % of the import "
+            f"before the fault: {'passed' if passed else 'FAILED'}. Modes passed through: {path}."
+        )
+        parts.append(figure(picture, alt=f"Waveforms of the worst replayed run. {text}", caption=text))
+    return section("The worst replayed cases", *parts)
