@@ -19,6 +19,8 @@ from dcvrt.integrators.equations import Equations
 Array = NDArray[np.float64]
 RANK_TOLERANCE = 1e-10
 RESIDUAL_TOLERANCE = 1e-9
+ROUGH, POLISH = 1e-3, 2
+"""Below this residual Newton's method is quadratic: so many full steps take it to round-off."""
 MAX_ITERATIONS = 60
 
 
@@ -45,7 +47,7 @@ def equilibrium(equations: Equations, u: Array, p: Array, q: Array, u_theta: Arr
     residual, jacobian, by_pu = (np.array(m) for m in equations.rest(w, u, p, q))
     size, undamped = np.abs(residual).max(initial=0.0), 0
     for _ in range(MAX_ITERATIONS):
-        if size < RESIDUAL_TOLERANCE and undamped:
+        if size < RESIDUAL_TOLERANCE and undamped >= POLISH:
             break
         step = -_pseudo_inverse(jacobian) @ residual[:, 0]
         cut = 1.0
@@ -58,7 +60,7 @@ def equilibrium(equations: Equations, u: Array, p: Array, q: Array, u_theta: Arr
             if cut < 1e-6:
                 _fail(equations, residual[:, 0])
         w = w + cut * step
-        undamped += cut == 1.0
+        undamped += cut == 1.0 and size < ROUGH
         residual, jacobian, by_pu = (np.array(m) for m in trial)
         size = np.abs(residual).max(initial=0.0)
     if not size < RESIDUAL_TOLERANCE:

@@ -221,7 +221,7 @@ class Findings:
         return SAME_SHARE * max(self.no_vrt_mw, 1.0)
 
     def best(self, mode: str | None = None) -> Row | None:
-        """The row with the largest total that passed replay and power flow; the smaller beta where totals are equal."""
+        """The row with the largest total that passed every check; the smaller beta where totals are equal."""
         passed = [row for row in self.rows(mode) if verdict(row) == "passed" and ac_verdict(row) == "passed"]
         if not passed:
             return None
@@ -248,7 +248,7 @@ class Findings:
         return said
 
     def shortfalls(self) -> list[str]:
-        """A sentence for each mode and method whose highest beta stays below the plan without ride-through."""
+        """A sentence for each mode and method whose highest beta stays below the no-ride-through plan."""
         said = []
         for mode in self.modes:
             for method in self.methods:
@@ -345,8 +345,10 @@ class Case:
 def verdict(row: Row) -> str:
     """Outcome of the replay of a row: passed, failed, or nothing hosted and so nothing replayed.
 
-    >>> verdict({"total_mw": 0.0, "replay": {"passed": True}}), verdict({"total_mw": 9.0, "replay": {"passed": False}})
-    ('nothing hosted', 'failed')
+    >>> verdict({"total_mw": 0.0, "replay": {"passed": True}})
+    'nothing hosted'
+    >>> verdict({"total_mw": 9.0, "replay": {"passed": False}})
+    'failed'
     """
     if not row["total_mw"] > 0:
         return "nothing hosted"

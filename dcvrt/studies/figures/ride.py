@@ -71,7 +71,7 @@ def draw(signals: Signals, modes: Sequence[str], title: str, v_it_min: float | N
 
 
 def signals_of(run: Trajectory, v_poi: Any) -> dict[str, Any]:
-    """Signals of a trajectory under the names that `draw` reads; `v_poi` is the imposed phasor on its times."""
+    """Signals of a trajectory under the names that `draw` reads; `v_poi` is the imposed phasor."""
     outputs = {key: run[key] for key in ("v_it", "p_g", "p_b", "p_it", "p_cool", "q_g", "mode")}
     return {"t_s": run.t, "v_poi": np.abs(v_poi), **outputs}
 

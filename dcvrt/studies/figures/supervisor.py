@@ -66,7 +66,7 @@ def guard_text(text: str) -> str:
 
     >>> guard_text("MIXED -> BATTERY: v_f < V_deep held T_deep")
     '$v_f$ < $V_{\\mathrm{deep}}$ for $T_{\\mathrm{deep}}$'
-    >>> guard_text("BATTERY -> RETURN: v_f > V_back and v_f < V_calm and error > (-e_sync) and error < e_sync")
+    >>> guard_text("B -> R: v_f > V_back and v_f < V_calm and error > (-e_sync) and error < e_sync")
     '$V_{\\mathrm{back}}$ < $v_f$ < $V_{\\mathrm{calm}}$ and |error| < $e_{\\mathrm{sync}}$'
     >>> guard_text("RETURN -> NORMAL: always held T_ramp")
     'after $T_{\\mathrm{ramp}}$'
@@ -175,7 +175,7 @@ def _box(axes: Axes, mode: str, note: str, centre: tuple[float, float], shade: s
 
 
 def _edge(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str, paired: bool) -> None:
-    """Draw an arrow from box to box, beside its counterpart, with its text on the outer side or towards the middle."""
+    """Draw an arrow from box to box, beside its counterpart, with its text outside or towards the middle."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = math.hypot(dx, dy)
     side = (-dy / length, dx / length)  # to the left of the direction of travel

@@ -1,4 +1,4 @@
-"""Waveforms of the worst replayed case of a mode: voltages of the grid, and what the facility made of them."""
+"""Waveforms of the worst replayed case of a mode: the grid's voltages, what the facility made of them."""
 
 from __future__ import annotations
 

@@ -8,12 +8,11 @@ from importlib import resources
 from pathlib import Path
 from string import Template
 
-from dcvrt.studies.report import answer, checks, grid, models, plans, record
-from dcvrt.studies.report.page import Safe, escape
-
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
+from dcvrt.studies.report import answer, checks, grid, models, plans, record
+from dcvrt.studies.report.page import Safe, escape
 
 REPORT = "report.html"
 
