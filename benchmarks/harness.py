@@ -14,7 +14,7 @@ from typing import Any, TypedDict
 
 
 class Result(TypedDict):
-    """One row: ours beside a baseline. `ratio` = baseline_value / value; `error` is the accuracy both were held to."""
+    """One row: ours beside a baseline; `ratio` = baseline_value / value, `error` the accuracy of both."""
 
     case: str
     metric: str
@@ -50,13 +50,16 @@ def result(
 
 
 def seconds(call: Callable[[], Any], repeats: int = 5) -> float:
-    """Least wall time of `repeats` calls, s, after one call that warms caches."""
+    """Least processor time of `repeats` calls, s, after one call that warms caches.
+
+    Not wall time: on a shared machine that is other people's work.
+    """
     call()
     best = float("inf")
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.process_time()
         call()
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     return best
 
 

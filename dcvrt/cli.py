@@ -1,7 +1,7 @@
 """The command line. What is heavy is imported inside the commands, so that `dcvrt --help` answers at once.
 
-Exit codes: 0 done; 1 internal error; 2 bad input; 3 the question has no answer (infeasible); 4 incomplete: something
-was set aside or did not reach its end.
+Exit codes: 0 done; 1 internal error; 2 bad input; 3 the question has no answer (infeasible); 4 incomplete:
+something was set aside or did not reach its end.
 """
 
 from __future__ import annotations
@@ -17,9 +17,16 @@ from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationErro
 
 OK, INTERNAL, BAD_INPUT, INFEASIBLE, INCOMPLETE = range(5)
 
-app = typer.Typer(name="dcvrt", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-                  help="How much data-centre load a grid can host when every site must ride through the grid's faults.")
-study = typer.Typer(no_args_is_help=True, help="A study: one TOML file in, one folder of tables, figures and report out.")
+app = typer.Typer(
+    name="dcvrt",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="How much data-centre load a grid can host when every site must ride through the grid's faults.",
+)
+study = typer.Typer(
+    no_args_is_help=True, help="A study: one TOML file in, one folder of tables, figures and report out."
+)
 facility = typer.Typer(no_args_is_help=True, help="The facility variants: what they are made of.")
 app.add_typer(study, name="study")
 app.add_typer(facility, name="facility")
@@ -29,22 +36,30 @@ TEST_WAVEFORMS = ("ercot-style", "sag-30", "sag-50", "sag-70", "sag-85")
 
 
 @app.callback(invoke_without_command=True)
-def _root(show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False) -> None:
+def _root(
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
     if show_version:
         print(f"dcvrt {__version__}")
         raise typer.Exit(OK)
 
 
-# -- study --------------------------------------------------------------------------------------------------------
+# -- study ---------------------------------------------------------------------------------------------------
 
 
 @study.command("run")
 def study_run(
     file: Annotated[Path | None, typer.Argument(help="Study file; without one, the IEEE-118 study.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the results; the same folder again resumes.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; the same folder again resumes.")
+    ] = None,
     workers: Annotated[int, typer.Option(help="Worker processes on this machine.")] = 2,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a running dask scheduler, instead of own workers.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer samples, periods and ratings: minutes instead of more.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running dask scheduler, instead of own workers.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer samples, periods and ratings: minutes instead of more.")
+    ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Do once more what was set aside.")] = False,
 ) -> None:
     """Run a study, or go on with an interrupted one."""
@@ -78,12 +93,16 @@ def study_check(file: Annotated[Path, typer.Argument(help="Study file.")]) -> No
     from dcvrt.studies.study import Study
 
     s = Study.load(file).file
-    print(f"{file}: in order: {len(s.grid.sites)} sites, {len(s.fault)} faults, {len(s.period)} periods, "
-          f"{len(s.facility.modes)} modes, {len(s.facility.beta)} ratings, {s.sampling.n} samples")
+    print(
+        f"{file}: in order: {len(s.grid.sites)} sites, {len(s.fault)} faults, {len(s.period)} periods, "
+        f"{len(s.facility.modes)} modes, {len(s.facility.beta)} ratings, {s.sampling.n} samples"
+    )
 
 
 @study.command("report")
-def study_report(folder: Annotated[Path, typer.Argument(help="Folder that 'dcvrt study run' has made.")]) -> None:
+def study_report(
+    folder: Annotated[Path, typer.Argument(help="Folder that 'dcvrt study run' has made.")],
+) -> None:
     """Write tables, figures and report again from the store of a finished study."""
     from dcvrt.studies.study import Result
 
@@ -103,34 +122,60 @@ def study_schema() -> None:
 
 
 def _show(result: object) -> None:
-    """Print the table of plans and where the rest is; say what is missing and end with code 4 if anything is."""
+    """Print the table of plans and where the rest is; say what is missing and end with code 4 if anything
+    is."""
     from rich.console import Console
     from rich.table import Table
 
+    from dcvrt.studies.store import records
     from dcvrt.studies.study import Result
 
     assert isinstance(result, Result)
     frame = result.table()
-    sites = [column for column in frame if str(column).startswith("bus_")]
-    shown = Table("method", "mode", "beta", "MW", *[f"bus {c[4:-3]}" for c in sites], "replay", "voltage margin", "loss margin",
-                  "AC")
-    for row in frame.to_dict("records"):
+    sites = [str(column) for column in frame if str(column).startswith("bus_")]
+    shown = Table(
+        "method",
+        "mode",
+        "beta",
+        "MW",
+        *[f"bus {c[4:-3]}" for c in sites],
+        "replay",
+        "voltage margin",
+        "loss margin",
+        "AC",
+    )
+    for row in records(frame):
         verdict = {"failed": "[red]failed[/]", "passed": "[green]passed[/]"}.get(row["replay"], row["replay"])
-        shown.add_row(row["method"], row["mode"], _number(row["beta"], "g"), _number(row["total_mw"], ".2f"),
-                      *[_number(row[c], ".2f") for c in sites], verdict, _number(row["worst_voltage_margin_pu"], ".4f"),
-                      _number(row["worst_loss_margin_mw"], ".2f"), row["ac"])
+        shown.add_row(
+            row["method"],
+            row["mode"],
+            _number(row["beta"], "g"),
+            _number(row["total_mw"], ".2f"),
+            *[_number(row[c], ".2f") for c in sites],
+            verdict,
+            _number(row["worst_voltage_margin_pu"], ".4f"),
+            _number(row["worst_loss_margin_mw"], ".2f"),
+            row["ac"],
+        )
     console = Console()
     if not sys.stdout.isatty():
         console.width = 120
     console.print(shown)
     counts = result.summary["simulations"]
-    console.print(f"{counts['grid']} fault simulations, {counts['facility']} facility runs, {counts['failed']} failed, "
-                  f"{counts['quarantined']} task(s) set aside; report: {result.folder / 'report.html'}", highlight=False)
+    console.print(
+        f"{counts['grid']} fault simulations, {counts['facility']} facility runs, {counts['failed']} failed, "
+        f"{counts['quarantined']} task(s) set aside; report: {result.folder / 'report.html'}",
+        highlight=False,
+    )
     if not result.complete:
         for line in result.lost:
             print(line, file=sys.stderr)
-        print("The study is incomplete: plans with missing runs count as failed. Way out: look at the messages above, "
-              "then run again with --retry.", file=sys.stderr)
+        print(
+            "The study is incomplete: plans with missing runs count as failed. Way out: look at the "
+            "messages above, "
+            "then run again with --retry.",
+            file=sys.stderr,
+        )
         raise typer.Exit(INCOMPLETE)
 
 
@@ -138,15 +183,19 @@ def _number(value: object, form: str) -> str:
     return "" if value is None or value != value else format(value, form)
 
 
-# -- one facility -------------------------------------------------------------------------------------------------
+# -- one facility --------------------------------------------------------------------------------------------
 
 
 @app.command()
 def ride(
     variant: Annotated[str, typer.Argument(help="Facility variant; 'dcvrt facility list' shows them.")],
-    waveform: Annotated[str, typer.Option(help=f"CSV file with columns t and v, or one of {', '.join(TEST_WAVEFORMS)}.")],
+    waveform: Annotated[
+        str, typer.Option(help=f"CSV file with columns t and v, or one of {', '.join(TEST_WAVEFORMS)}.")
+    ],
     beta: Annotated[float, typer.Option(help="Converter rating over hosted capacity.")] = 1.15,
-    out: Annotated[Path | None, typer.Option(help="Folder for the signals (CSV) and their picture (SVG).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the signals (CSV) and their picture (SVG).")
+    ] = None,
 ) -> None:
     """Run one facility on one waveform: margins, events, signals."""
     from dcvrt.studies.single import ride as run_one
@@ -174,7 +223,7 @@ def facility_sheet(variant: Annotated[str, typer.Argument(help="Facility variant
     print(variants.get(variant).sheet())
 
 
-# -- the machine --------------------------------------------------------------------------------------------------
+# -- the machine ---------------------------------------------------------------------------------------------
 
 
 @app.command()
@@ -188,7 +237,7 @@ def doctor() -> None:
         raise typer.Exit(INCOMPLETE)
 
 
-# -- entry --------------------------------------------------------------------------------------------------------
+# -- entry ---------------------------------------------------------------------------------------------------
 
 
 def code_of(error: DcvrtError) -> int:

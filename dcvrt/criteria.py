@@ -5,19 +5,21 @@ Both margins rest on one functional, the least level below which a signal stays 
 .. math::
     y^\ast = \min_s \max_{[s, s+D]} y = \inf \{v : \text{a stretch with } y \le v \text{ lasts at least } D\}.
 
-On the cubic through the samples the stretch {y <= v} has ends a(v), b(v), and y* is reached in one of two ways:
+On the cubic through the samples the stretch {y <= v} has ends a(v), b(v), and y* is reached in one of two
+ways:
 
-* b(v) - a(v) = D. A free end moves by da/dv = 1/y'(a) and da/dtheta = -y_theta/y'(a); an end held at a jump or
-  event by da/dv = 0 and da/dtheta = that of the event's time (0 at an input jump). From
+* b(v) - a(v) = D. A free end moves by da/dv = 1/y'(a) and da/dtheta = -y_theta/y'(a); an end held at a jump
+  or event by da/dv = 0 and da/dtheta = that of the event's time (0 at an input jump). From
   dy*/dtheta = -(b_theta - a_theta)/(b_v - a_v): with two free ends (y'(a) y_theta(b) - y'(b) y_theta(a)) /
   (y'(a) - y'(b)); with a held at time t_a, y_theta(b) + y'(b) dt_a/dtheta.
-* a local maximum of y that parts a long stretch into short ones. Its derivative is y_theta (envelope theorem), or
-  y_theta + y' dt_e/dtheta if it stands at an event: the time of an event moves, and y is not stationary there.
+* a local maximum of y that parts a long stretch into short ones. Its derivative is y_theta (envelope
+  theorem), or y_theta + y' dt_e/dtheta if it stands at an event: the time of an event moves, and y is not
+  stationary there.
 
 For D = 0 it is the plain minimum, with the same two kinds of derivative.
 Paper: eqs. (sustained_it_voltage), (voltage_margin), (loss_margin).
-Differs: the paper's sustained voltage, min over s of the *min* over the window, does not depend on the window; it
-is here as criterion="instantaneous".
+Differs: the paper's sustained voltage, min over s of the *min* over the window, does not depend on the
+window; it is here as criterion="instantaneous".
 """
 
 from __future__ import annotations
@@ -125,7 +127,11 @@ class Margins:
         for name, margin in (("voltage", self.voltage), ("loss", self.loss)):
             row[name] = margin.value
             row |= {f"d_{name}/d_{theta}": value for theta, value in margin.grad.items()}
-            row[f"{name}_time"], row[f"{name}_kind"], row[f"{name}_tie"] = margin.time, margin.kind, margin.tie
+            row[f"{name}_time"], row[f"{name}_kind"], row[f"{name}_tie"] = (
+                margin.time,
+                margin.kind,
+                margin.tie,
+            )
         return {**row, **self.diagnostics, "recovered": self.recovered, "sequence": " | ".join(self.sequence)}
 
 
@@ -150,7 +156,9 @@ def margins(run: Trajectory, criteria: Criteria | None = None) -> Margins:
     power = Curve.of(run, "p_g")
     pre, pre_theta = float(power.y[0]), power.y_theta[0]
     if not pre > 0:
-        raise InputError(f"margins: the import before the fault is p_g = {pre:g} pu; a load loss has no reference.")
+        raise InputError(
+            f"margins: the import before the fault is p_g = {pre:g} pu; a load loss has no reference."
+        )
     window = criteria.window if criteria.criterion == "sustained" else 0.0
     low = sustained_minimum(voltage, window)
     held = sustained_minimum(power, criteria.loss_window)
@@ -240,16 +248,29 @@ class Curve:
         for left, moved in zip(run.breaks, run.break_grad, strict=True):
             kind[left : left + 2] = "event" if float(run.t[left]) in event_times else "jump"
             t_theta[left : left + 2] = moved
-        return cls.with_extrema(run.t, signals.value[:, k], signals.rate[:, k], y_theta, rate_theta, t_theta, kind)
+        return cls.with_extrema(
+            run.t, signals.value[:, k], signals.rate[:, k], y_theta, rate_theta, t_theta, kind
+        )
 
     @classmethod
     def with_extrema(
-        cls, t: Array, y: Array, rate: Array, y_theta: Array, rate_theta: Array, t_theta: Array, kind: NDArray[np.str_]
+        cls,
+        t: Array,
+        y: Array,
+        rate: Array,
+        y_theta: Array,
+        rate_theta: Array,
+        t_theta: Array,
+        kind: NDArray[np.str_],
     ) -> Curve:
         """Add the extrema of the cubics to the samples."""
         h = np.diff(t)
         rise = np.diff(y)
-        c1, c2, c3 = rate[:-1] * h, 3 * rise - (2 * rate[:-1] + rate[1:]) * h, (rate[:-1] + rate[1:]) * h - 2 * rise
+        c1, c2, c3 = (
+            rate[:-1] * h,
+            3 * rise - (2 * rate[:-1] + rate[1:]) * h,
+            (rate[:-1] + rate[1:]) * h - 2 * rise,
+        )
         places, fractions = [], []
         with np.errstate(divide="ignore", invalid="ignore"):
             disc = np.sqrt(c2 * c2 - 3 * c3 * c1)
@@ -355,9 +376,7 @@ class Curve:
         return self.y_theta[k] + self.rate[k] * self.t_theta[k]
 
 
-def hermite(
-    h: Array, s: Array, value: Array, rate: Array, place: NDArray[np.int64]
-) -> tuple[Array, Array]:
+def hermite(h: Array, s: Array, value: Array, rate: Array, place: NDArray[np.int64]) -> tuple[Array, Array]:
     """Columns and their rates on cubics, at fraction `s` of the intervals `place`."""
     h, s = h[:, None], s[:, None]
     a, m0, m1 = value[place], rate[place] * h, rate[place + 1] * h
@@ -382,7 +401,8 @@ def sustained_minimum(curve: Curve, window: float) -> Extremum:
     span = float(curve.t[-1] - curve.t[0])
     if span < window:
         raise InputError(f"margins: the run lasts {span:g} s, less than the window of {window:g} s.")
-    # between neighbouring maxima the stretches below a level do not merge, so that the longest grows continuously
+    # between neighbouring maxima the stretches below a level do not merge, so that the longest grows
+    # continuously
     y = curve.y
     rises, falls = np.append(True, y[1:] >= y[:-1]), np.append(y[:-1] >= y[1:], True)
     maxima = np.unique(y[rises & falls])
@@ -417,7 +437,9 @@ def _at_maximum(curve: Curve, level: float, window: float) -> Extremum:
     _, first, last, _, _ = curve.longest(level)
     inside = np.arange(first, last + 1)
     k = int(inside[np.argmax(curve.y[inside])])
-    return Extremum(level, curve.at_node(k), float(curve.t[k]), str(curve.kind[k]), _tied(curve, level, window))
+    return Extremum(
+        level, curve.at_node(k), float(curve.t[k]), str(curve.kind[k]), _tied(curve, level, window)
+    )
 
 
 def _at_window(curve: Curve, level: float, window: float) -> Extremum:
@@ -426,7 +448,9 @@ def _at_window(curve: Curve, level: float, window: float) -> Extremum:
     a_theta, a_slope = _end(curve, first - 1, begin)
     b_theta, b_slope = _end(curve, last, end)
     if a_slope is None and b_slope is None:
-        gradient = np.full(len(a_theta), math.nan)  # both ends are held: no such stretch has exactly the window
+        gradient = np.full(
+            len(a_theta), math.nan
+        )  # both ends are held: no such stretch has exactly the window
     elif a_slope is None:
         gradient = b_theta + (b_slope or 0.0) * a_theta
     elif b_slope is None:
@@ -439,7 +463,7 @@ def _at_window(curve: Curve, level: float, window: float) -> Extremum:
 
 
 def _end(curve: Curve, interval: int, time: float) -> tuple[Array, float | None]:
-    """End of a stretch: y_theta and slope there if it is free; derivative of its time and None if it is held."""
+    """End of a stretch: y_theta and slope there if it is free; derivative of its time and None if held."""
     if interval < 0 or interval >= len(curve.t) - 1:
         return np.zeros(curve.y_theta.shape[1]), None
     h = curve.t[interval + 1] - curve.t[interval]

@@ -137,7 +137,7 @@ class Trajectory:
         return signals.value[:, k]
 
     def at(self, name: str, t: ArrayLike) -> Array:
-        """Signal at any times: cubic between samples for outputs, linear otherwise; after the jump at a jump."""
+        """Signal at any times: cubic between samples for outputs, else linear; after the jump at a jump."""
         signals, k = self._find(name)
         t = np.asarray(t, dtype=float)
         i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
@@ -166,7 +166,9 @@ class Trajectory:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        wanted = list(signals or [n for n in ("v_it", "w_dc", "p_g", "p_b", "i_g", "q_g") if n in self.outputs.names])
+        wanted = list(
+            signals or [n for n in ("v_it", "w_dc", "p_g", "p_b", "i_g", "q_g") if n in self.outputs.names]
+        )
         if not wanted:
             wanted = list(self.outputs.names[:6] or self.states.names[:6])
         figure = Figure(figsize=(7.0, 1.3 * len(wanted) + 0.8), layout="constrained")

@@ -6,10 +6,11 @@ twice is a jump**: the first value holds up to it, the second from it on. Betwee
 .. math::
     V(t_k + s T_k) = c_0 + c_1 s + c_2 s^2 + c_3 s^3, \qquad 0 \le s \le 1,
 
-through the samples, with the slope of the parabola through three neighbours at inner samples and the one-sided
-parabola at jumps and ends. The slopes are linear in the samples, so a tangent dV/dtheta that is given on the
-same times is interpolated to the exact derivative of V(t). Two points alone are joined by a straight line, which
-is why the stepped waveforms below mark their corners as (empty) jumps: constants and ramps are met exactly.
+through the samples, with the slope of the parabola through three neighbours at inner samples and the
+one-sided parabola at jumps and ends. The slopes are linear in the samples, so a tangent dV/dtheta that is
+given on the same times is interpolated to the exact derivative of V(t). Two points alone are joined by a
+straight line, which is why the stepped waveforms below mark their corners as (empty) jumps: constants and
+ramps are met exactly.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import cmath
 import csv
 import io
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -75,21 +77,21 @@ class Pieces:
 
 def cubic_pieces(t: Array, v: NDArray[Any]) -> Pieces:
     """Pieces of the C1 cubic through `v` at `t`; a time that stands twice is a jump."""
-    slope_left, slope_right = _slopes(t, v)
+    slope = _slopes(t, v)
     real = np.flatnonzero(np.diff(t) > 0)
     length = t[real + 1] - t[real]
-    m0, m1, rise = slope_right[real] * length, slope_left[real + 1] * length, v[real + 1] - v[real]
+    m0, m1, rise = slope[real] * length, slope[real + 1] * length, v[real + 1] - v[real]
     coefficients = np.stack((v[real], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise), axis=1)
     after_jump = np.zeros(len(real), dtype=bool)
     after_jump[1:] = np.diff(real) > 1
     return Pieces(t[real], length, coefficients, after_jump)
 
 
-def _slopes(t: Array, v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Slopes towards the left and the right of every sample: parabola through three neighbours between jumps."""
+def _slopes(t: Array, v: NDArray[Any]) -> NDArray[Any]:
+    """Slope at every sample: of the parabola through three neighbours between jumps."""
     slope = np.zeros_like(v)
     edges = np.concatenate(([0], np.flatnonzero(np.diff(t) == 0) + 1, [len(t)]))
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         if b - a < 2:
             continue
         h = np.diff(t[a:b])
@@ -100,7 +102,7 @@ def _slopes(t: Array, v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         slope[a + 1 : b - 1] = (h[1:] * secant[:-1] + h[:-1] * secant[1:]) / (h[:-1] + h[1:])
         slope[a] = secant[0] + h[0] * (secant[0] - secant[1]) / (h[0] + h[1])
         slope[b - 1] = secant[-1] + h[-1] * (secant[-1] - secant[-2]) / (h[-1] + h[-2])
-    return slope, slope
+    return slope
 
 
 def check_samples(t: ArrayLike, v: ArrayLike, what: str) -> list[str]:
@@ -127,7 +129,8 @@ def check_samples(t: ArrayLike, v: ArrayLike, what: str) -> list[str]:
     if len(triple):
         k = triple[0]
         problems.append(
-            f"t[{k}] = t[{k + 1}] = t[{k + 2}] = {t[k]:g} s: a time may stand twice (a jump), not three times."
+            f"t[{k}] = t[{k + 1}] = t[{k + 2}] = {t[k]:g} s: "
+            "a time may stand twice (a jump), not three times."
         )
     if not problems and t[-1] <= t[0]:
         problems.append(f"it lasts no time: first and last time are {t[0]:g} s.")
@@ -148,7 +151,8 @@ class Waveform:
     Raises
     ------
     InputError
-        NaN, times that do not increase, a time that stands three times, fewer than two samples, shapes that differ.
+        NaN, times that do not increase, a time that stands three times, fewer than two samples, shapes that
+        differ.
 
     Examples
     --------
@@ -189,9 +193,9 @@ class Waveform:
 
         Parameters
         ----------
-        steps : entries ``(t, v)`` - from `t` on the voltage is `v` - or ``(t, v_from, v_to)`` - at `t` it steps to
-            `v_from` and goes straight to `v_to`, which it reaches when the next entry begins. Values are
-            magnitudes or complex, pu.
+        steps : entries ``(t, v)`` - from `t` on the voltage is `v` - or ``(t, v_from, v_to)`` - at `t` it
+            steps to `v_from` and goes straight to `v_to`, which it reaches when the next entry begins. Values
+            are magnitudes or complex, pu.
         until : end of the waveform, s; 1 s after the last entry unless given.
 
         Examples
@@ -231,8 +235,8 @@ class Waveform:
         Parameters
         ----------
         retained : voltage magnitude in the sag, pu.
-        start, length, until : begin and duration of the sag and end of the waveform, s; a sag that lasts longer
-            than the waveform ends with it.
+        start, length, until : begin and duration of the sag and end of the waveform, s; a sag that lasts
+            longer than the waveform ends with it.
         phase_jump : angle of the phasor during the sag, rad.
         """
         if retained < 0.0 or length <= 0.0:
@@ -289,9 +293,9 @@ class Waveform:
         """Read a table with a header: a time column in s and the voltage in pu.
 
         The voltage is `v_re` and `v_im`, or a magnitude with or without `angle` in degrees, or three RMS
-        phase voltages `v_a`, `v_b`, `v_c` that `phases` reduces to their minimum or mean (a facility model here
-        is positive-sequence: the minimum is the careful choice). Separators ``,`` ``;`` or tab, a byte-order
-        mark, a decimal comma, a leading count line and lines that begin with ``#`` are understood.
+        phase voltages `v_a`, `v_b`, `v_c` that `phases` reduces to their minimum or mean (a facility model
+        here is positive-sequence: the minimum is the careful choice). Separators ``,`` ``;`` or tab, a
+        byte-order mark, a decimal comma, a leading count line and lines that begin with ``#`` are understood.
 
         Raises
         ------
@@ -320,8 +324,8 @@ class Waveform:
 
         Parameters
         ----------
-        magnitude, angle : names of the analogue channels with the magnitude and the angle in degrees. Channels with
-            the instantaneous wave are not phasors: take their phasor first.
+        magnitude, angle : names of the analogue channels with the magnitude and the angle in degrees.
+            Channels with the instantaneous wave are not phasors: take their phasor first.
         base : value of `magnitude` that is 1 pu.
         """
         try:
@@ -387,7 +391,8 @@ class Waveform:
         if tangent not in cache:
             if tangent is not None and tangent not in self.tangents:
                 raise InputError(
-                    f"waveform {self.name!r} has no tangent {tangent!r}.{did_you_mean(tangent, self.tangents)}"
+                    f"waveform {self.name!r} has no tangent {tangent!r}."
+                    f"{did_you_mean(tangent, self.tangents)}"
                 )
             cache[tangent] = cubic_pieces(self.t, self.v if tangent is None else self.tangents[tangent])
         return cache[tangent]
@@ -410,7 +415,7 @@ class Waveform:
         if not dt > 0:
             raise InputError(f"waveform: dt = {dt:g} s must be positive.")
         edges = np.concatenate(([0], np.flatnonzero(np.diff(self.t) == 0) + 1, [len(self.t)]))
-        runs = [(self.t[a], self.t[b - 1]) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 1]
+        runs = [(self.t[a], self.t[b - 1]) for a, b in itertools.pairwise(edges) if b - a > 1]
         grids = [np.linspace(a, b, max(2, math.ceil((b - a) / dt - 1e-9) + 1)) for a, b in runs]
         t = np.concatenate(grids)
 
@@ -502,12 +507,13 @@ def _voltage(table: Mapping[str, Array], phases: str | None, where: str) -> Comp
                     "the model is positive-sequence."
                 )
             stacked = np.stack([table[name] for name in three])
-            return (stacked.min(axis=0) if phases == "minimum" else stacked.mean(axis=0)).astype(complex)
+            return (stacked.min(axis=0) if phases == "minimum" else stacked.mean(axis=0)) + 0j
     for name in MAGNITUDE_NAMES:
         if name in table:
             angle = next((table[a] for a in ANGLE_NAMES if a in table), None)
-            return table[name] * (1.0 if angle is None else np.exp(1j * np.deg2rad(angle))) + 0j
+            turn = np.zeros(len(table[name])) if angle is None else np.deg2rad(angle)
+            return np.asarray(table[name] * np.exp(1j * turn), dtype=complex)
     raise InputError(
-        f"{where} has no voltage column: v_re and v_im, or one of {', '.join(MAGNITUDE_NAMES)} (with angle_deg), "
-        f"or v_a, v_b and v_c. Found: {', '.join(table)}."
+        f"{where} has no voltage column: v_re and v_im, or one of {', '.join(MAGNITUDE_NAMES)} "
+        f"(with angle_deg), or v_a, v_b and v_c. Found: {', '.join(table)}."
     )

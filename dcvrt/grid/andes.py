@@ -209,6 +209,7 @@ def read(path: Path, dynamics: Path | None = None) -> Any:
                 use_input_path=False,
                 no_output=True,
                 default_config=True,
+                config_option=["PQ.pq2z=0"],  # else power flow serves less load below 0.8 pu, silently
                 addfile=str(dynamics) if dynamics else None,
                 pycode_path=str(code),
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -192,17 +192,22 @@ class OperatingPoint:
         y = self.system.TDS._y_t0
         return np.asarray(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
 
-    def subtransient_admittance(self) -> Phasors:
+    def machine_admittance(self, reactance: Literal["subtransient", "transient"]) -> Phasors:
         """Admittance between each bus and the internal voltage of its machines, pu, in bus order.
 
-        A machine with x_d'' != x_q'' enters with their mean.
+        Parameters
+        ----------
+        reactance : str
+            `subtransient`: the mean of x_d'' and x_q'', for the instant after inception; `transient`: x_d',
+            for some cycles later. A classical machine has only x_d'.
         """
         system = self.system
         position = {idx: k for k, idx in enumerate(system.Bus.idx.v)}
         y = np.zeros(system.Bus.n, dtype=complex)
         for model in system.SynGen.models.values():
             if model.n:
-                x = 0.5 * (model.xd2.v + model.xq2.v) if hasattr(model, "xd2") else model.xd1.v
+                subtransient = reactance == "subtransient" and hasattr(model, "xd2")
+                x = 0.5 * (model.xd2.v + model.xq2.v) if subtransient else model.xd1.v
                 np.add.at(y, [position[bus] for bus in model.bus.v], model.ue.v / (model.ra.v + 1j * x))
         return y
 

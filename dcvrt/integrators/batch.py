@@ -46,7 +46,9 @@ class BatchResult:
     def rows(self) -> list[dict[str, Any]]:
         """One flat mapping per case: parameters, margins with gradients, diagnostics, sequence, status."""
         result = []
-        for name, values, status, m in zip(self.waveforms, self.parameters, self.status, self.margins, strict=True):
+        for name, values, status, m in zip(
+            self.waveforms, self.parameters, self.status, self.margins, strict=True
+        ):
             row: dict[str, Any] = {"waveform": name, **values}
             if m is not None:
                 row |= m.flat()
@@ -76,7 +78,7 @@ def run_batch(
     for waveform, values in cases:
         run: Trajectory | None = None
         try:
-            run = simulator.attempt(waveform, **values)
+            run = simulator.attempt(waveform, None, **values)
             outcome = run.status
         except SimulationError as error:
             outcome = str(error)
@@ -94,7 +96,9 @@ def _cases(
 ) -> list[tuple[Waveform, dict[str, float]]]:
     if isinstance(waveforms, Waveform):
         waveforms = [waveforms]
-    columns = {k: list(v) for k, v in table.items() if not isinstance(v, (int, float)) and hasattr(v, "__len__")}
+    columns = {
+        k: list(v) for k, v in table.items() if not isinstance(v, (int, float)) and hasattr(v, "__len__")
+    }
     lengths = {f"{k!r}": len(v) for k, v in columns.items()}
     if len(waveforms) != 1:
         lengths["waveforms"] = len(waveforms)
@@ -107,7 +111,10 @@ def _cases(
     n = next(iter(lengths.values()), 1)
     shared = {k: float(v) for k, v in table.items() if k not in columns}  # type: ignore[arg-type]
     cases = [
-        (waveforms[0] if len(waveforms) == 1 else waveforms[k], shared | {c: float(v[k]) for c, v in columns.items()})
+        (
+            waveforms[0] if len(waveforms) == 1 else waveforms[k],
+            shared | {c: float(v[k]) for c, v in columns.items()},
+        )
         for k in range(n)
     ]
     problems: dict[str, None] = {}

@@ -1,4 +1,4 @@
-"""Inputs of a run as one table of pieces: where every input is a cubic of time, and where any of them jumps."""
+"""Inputs of a run as one table of pieces: on each every input is a cubic of time; between some they jump."""
 
 from __future__ import annotations
 
@@ -78,7 +78,9 @@ def channels(equations: Equations, waveform: Waveform, inputs: Inputs | None) ->
     return Channels(start, length, C, sections, first, first_tangent)
 
 
-def _checked(equations: Equations, waveform: Waveform, inputs: dict[str, Any]) -> dict[str, tuple[Array, Array]]:
+def _checked(
+    equations: Equations, waveform: Waveform, inputs: dict[str, Any]
+) -> dict[str, tuple[Array, Array]]:
     dae, driven = equations.dae, equations.voltage or ()
     free = [n for k, n in enumerate(dae.u_names) if k not in driven]
     result = {}
@@ -89,8 +91,8 @@ def _checked(equations: Equations, waveform: Waveform, inputs: dict[str, Any]) -
         problems = check_samples(t, values, "values")
         if not problems and (t[0] > waveform.start + SAME_TIME or t[-1] < waveform.until - SAME_TIME):
             problems = [
-                f"it covers {t[0]:g} to {t[-1]:g} s, the waveform {waveform.start:g} to {waveform.until:g} s; "
-                "give samples for the whole run."
+                f"it covers {t[0]:g} to {t[-1]:g} s, "
+                f"the waveform {waveform.start:g} to {waveform.until:g} s; give samples for the whole run."
             ]
         if problems:
             raise InputError(f"input {name!r}: " + "\n".join(problems))
@@ -122,9 +124,7 @@ def _common(base: Pieces, others: list[Pieces]) -> tuple[Array, Array, NDArray[n
 
 def _tangents(equations: Equations, waveform: Waveform, start: Array, length: Array, C: Array) -> Array:
     first = np.zeros((equations.nu, equations.nw))
-    unknown = [
-        c.name for c in equations.columns if c.parameter is None and c.name not in waveform.tangents
-    ]
+    unknown = [c.name for c in equations.columns if c.parameter is None and c.name not in waveform.tangents]
     if unknown:
         known = [*equations.dae.p_names, *waveform.tangents]
         raise InputError(

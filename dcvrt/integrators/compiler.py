@@ -1,8 +1,9 @@
-"""Compile generated C once and keep it: compiler chain, cache of objects, interpreter when there is no compiler.
+"""Compile generated C once and keep it: compiler chain, cache of objects, interpreter when there is no
+compiler.
 
-Objects live in the user's cache folder under the hash of C text, compiler, flags and processor. A file appears
-there by one atomic rename, so that processes may build the same object at the same time and a killed compile
-leaves nothing that could be taken for a result.
+Objects live in the user's cache folder under the hash of C text, compiler, flags and processor. A file
+appears there by one atomic rename, so that processes may build the same object at the same time and a killed
+compile leaves nothing that could be taken for a result.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def find_compiler() -> Compiler | None:
 def _find(wanted: str, _path: str) -> Compiler | None:
     if wanted == "none":
         return None
-    chain = [tuple(wanted.split())] if wanted else [("cc",), ("gcc",), ("clang",)]
+    chain: list[tuple[str, ...]] = [tuple(wanted.split())] if wanted else [("cc",), ("gcc",), ("clang",)]
     if not wanted and importlib.util.find_spec("ziglang") is not None:
         chain.append((sys.executable, "-m", "ziglang", "cc"))
     for command in chain:
@@ -79,17 +80,22 @@ def _find(wanted: str, _path: str) -> Compiler | None:
         if answer.returncode == 0 and answer.stdout.strip():
             return Compiler(command, answer.stdout.splitlines()[0].strip())
     if wanted:
-        raise InputError(f"CC = {wanted!r} is not a compiler that runs. Unset CC, or set CC=none to interpret.")
+        raise InputError(
+            f"CC = {wanted!r} is not a compiler that runs. Unset CC, or set CC=none to interpret."
+        )
     return None
 
 
-def compiled(functions: Sequence[ca.Function], derivatives: Sequence[int] = ()) -> tuple[dict[str, ca.Function], str]:
+def compiled(
+    functions: Sequence[ca.Function], derivatives: Sequence[int] = ()
+) -> tuple[dict[str, ca.Function], str]:
     """Compile functions to one object and load them; without a compiler return them as they are.
 
     Parameters
     ----------
     functions : what to compile; names must differ.
-    derivatives : numbers of directions of forward derivatives of `rhs` to compile too, for implicit integrators.
+    derivatives : numbers of directions of forward derivatives of `rhs` to compile too, for implicit
+        integrators.
 
     Returns
     -------
@@ -119,7 +125,9 @@ def compiled(functions: Sequence[ca.Function], derivatives: Sequence[int] = ()) 
 def build(text: str, compiler: Compiler) -> Path:
     """Object of this C text, from the cache or compiled now."""
     flags = FLAGS if len(text) < LONG_TEXT else LONG_FLAGS
-    key = "\n".join((text, *compiler.command, compiler.version, *flags, platform.machine(), platform.processor()))
+    key = "\n".join(
+        (text, *compiler.command, compiler.version, *flags, platform.machine(), platform.processor())
+    )
     folder = cache_folder()
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.so"
     if path.is_file():
@@ -129,13 +137,17 @@ def build(text: str, compiler: Compiler) -> Path:
         place = tempfile.TemporaryDirectory(dir=folder, prefix="build-")
     except OSError as error:
         raise InputError(
-            f"The cache folder {folder} cannot be written: {error.strerror}. Set DCVRT_CACHE_DIR to one that can."
+            f"The cache folder {folder} cannot be written: {error.strerror}. "
+            "Set DCVRT_CACHE_DIR to one that can."
         ) from None
     with place as scratch:
         source, made = Path(scratch) / "model.c", Path(scratch) / "model.so"
         source.write_text(text, encoding="utf-8")
         done = subprocess.run(
-            [*compiler.command, *flags, str(source), "-o", str(made), "-lm"], capture_output=True, text=True, check=False
+            [*compiler.command, *flags, str(source), "-o", str(made), "-lm"],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         if done.returncode != 0:
             raise InputError(
@@ -149,7 +161,7 @@ def build(text: str, compiler: Compiler) -> Path:
 @lru_cache(maxsize=1)
 def _say_interpreted() -> None:
     warnings.warn(
-        "No C compiler was found: CasADi interprets the model, about five times slower with the same numbers. "
+        "No C compiler was found: CasADi interprets the model, several times slower with the same numbers. "
         "Install gcc or clang, or pip install 'dcvrt[compiler]'.",
         NoCompilerWarning,
         stacklevel=4,

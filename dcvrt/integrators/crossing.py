@@ -20,8 +20,8 @@ def first_crossing(t: Array, h: Array, rate: Array) -> tuple[int, dict[int, tupl
 
     Returns
     -------
-    interval number, and for each column that crosses in it the time at which the cubic does, and a time by which
-    it has; None when nothing crosses.
+    interval number, and for each column that crosses in it the time at which the cubic does, and a time by
+    which it has; None when nothing crosses.
     """
     over = h[1:] > 0
     step = np.diff(t)[:, None]
@@ -44,7 +44,7 @@ def first_crossing(t: Array, h: Array, rate: Array) -> tuple[int, dict[int, tupl
 
 
 def _peak(step: float, a: float, da: float, b: float, db: float) -> float | None:
-    """Fraction of the step at which the cubic through two samples is largest inside, if it is above zero there."""
+    """Fraction of the step at which the cubic through two samples is largest, if it is above zero there."""
     c1, c2, c3 = da * step, 3 * (b - a) - (2 * da + db) * step, (da + db) * step - 2 * (b - a)
     for s in quadratic_roots(3 * c3, 2 * c2, c1):
         if 0 < s < 1 and a + s * (c1 + s * (c2 + s * c3)) > 0:
@@ -53,7 +53,7 @@ def _peak(step: float, a: float, da: float, b: float, db: float) -> float | None
 
 
 def _rise(high: float, step: float, a: float, da: float, b: float, db: float) -> float:
-    """Fraction in [0, high] at which the cubic through two samples with slopes rises through zero, by bisection."""
+    """Fraction in [0, high] at which the cubic through two samples rises through zero, by bisection."""
     c1, c2, c3 = da * step, 3 * (b - a) - (2 * da + db) * step, (da + db) * step - 2 * (b - a)
     low = 0.0
     for _ in range(40):

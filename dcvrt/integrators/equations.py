@@ -7,8 +7,8 @@ With sensitivities S = dx/dtheta and S_z = dz/dtheta carried beside the states,
     0 = g_x S + g_z S_z + g_p p_\theta + g_u u_\theta + g_c c_\theta,
 
 as columns of the same system, so that they take part in the integrator's error control: left out of it,
-an explicit method runs at its stability limit and S is worthless. Each column is carried times the size of its
-parameter. A clock c = t - t_entry has the derivative -dt_entry/dtheta.
+an explicit method runs at its stability limit and S is worthless. Each column is carried times the size of
+its parameter. A clock c = t - t_entry has the derivative -dt_entry/dtheta.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ def voltage_channels(dae: Dae) -> tuple[int, int] | None:
     pairs = {stem: p for stem, p in parts.items() if len(p) == 2}
     if len(pairs) > 1:
         raise ModelError(
-            f"{dae.name} has {len(pairs)} phasor inputs ({', '.join(pairs)}); a simulator drives one, the POI voltage."
+            f"{dae.name} has {len(pairs)} phasor inputs ({', '.join(pairs)}); "
+            "a simulator drives one, the POI voltage."
         )
     return next(((p["re"], p["im"]) for p in pairs.values()), None)
 
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """One sensitivity column: a parameter of the system, a tangent of the waveform, or both under one name."""
+    """One sensitivity column: a parameter, a tangent of the waveform, or both under one name."""
 
     name: str
     parameter: int | None
@@ -104,7 +105,7 @@ class Equations:
         self.C = ca.SX.sym("C", 2 + self.n_coefficients)
 
     def _inputs_over_time(self) -> None:
-        """Inputs, their rates and the tangents of the phasor as cubics of time with the coefficients in `C`."""
+        """Inputs, their rates and the tangents of the phasor: cubics of time with the coefficients in `C`."""
         s = (self.dae.t - self.C[0]) / self.C[1]
 
         def channel(k: int) -> tuple[ca.SX, ca.SX]:
@@ -189,7 +190,7 @@ class Equations:
         return made
 
     def _rhs(self) -> ca.Function:
-        """dX/dtau and the algebraic residual in normalised time: group k spans tau in [k, k + 1], t in [t0, t0 + T]."""
+        """dX/dtau and the algebraic residual in normalised time tau; group k has t = t0 + T (tau - k)."""
         dae = self.dae
         tau, k, t0, length = (ca.SX.sym(n) for n in ("tau", "k", "t0", "T"))
         ode, alg = dae.f, dae.g
@@ -202,7 +203,11 @@ class Equations:
         ode, alg = (ca.densify(ca.substitute(e, dae.t, t)) for e in closed)
         group = ca.vertcat(k, t0, length, self.C)
         return ca.Function(
-            "rhs", [tau, self.X, self.Z, self.P, group], [length * ode, alg], ["t", "x", "z", "p", "u"], ["ode", "alg"]
+            "rhs",
+            [tau, self.X, self.Z, self.P, group],
+            [length * ode, alg],
+            ["t", "x", "z", "p", "u"],
+            ["ode", "alg"],
         )
 
     def _outputs(self) -> tuple[ca.SX, ...]:
@@ -225,7 +230,9 @@ class Equations:
         """`held` of every row and its derivative by every theta (times scale)."""
         held = ca.vertcat(ca.SX(0, 1), *[ca.SX(r.held) for _, r in self.rows])
         columns = [
-            ca.jacobian(held, self.dae.p[c.parameter]) * c.scale if c.parameter is not None else ca.SX.zeros(len(self.rows))
+            ca.jacobian(held, self.dae.p[c.parameter]) * c.scale
+            if c.parameter is not None
+            else ca.SX.zeros(len(self.rows))
             for c in self.columns
         ]
         slopes = ca.horzcat(*columns) if columns else ca.SX(len(self.rows), 0)
@@ -233,10 +240,12 @@ class Equations:
 
     @cached_property
     def rest(self) -> ca.Function:
-        """Equilibrium residual of (x, z) at fixed inputs, its Jacobian, and its derivative by p and u; the start."""
+        """Equilibrium residual of (x, z) at fixed inputs, its Jacobian, and its derivative by p and u."""
         dae = self.dae
         w = ca.vertcat(dae.x, dae.z)
-        residual = ca.substitute(ca.vertcat(dae.f, dae.g), ca.vertcat(dae.t, dae.clocks), ca.SX.zeros(1 + self.na))
+        residual = ca.substitute(
+            ca.vertcat(dae.f, dae.g), ca.vertcat(dae.t, dae.clocks), ca.SX.zeros(1 + self.na)
+        )
         by_pu = ca.jacobian(residual, ca.vertcat(dae.p, dae.u))
         outputs = [ca.densify(e) for e in (residual, ca.jacobian(residual, w), by_pu)]
         return ca.Function("rest", [w, dae.u, dae.p, dae.q], outputs)

@@ -1,8 +1,8 @@
 r"""Where a run starts: the equilibrium at the first value of the waveform.
 
 Solves f = 0, g = 0 in (x, z) at fixed inputs by a damped Newton method whose steps have least norm, from the
-start values of the system. Directions that the equations leave open (a state of charge at zero battery power) keep
-their start values. With J = d(f, g)/d(x, z) and its pseudo-inverse J^+,
+start values of the system. Directions that the equations leave open (a state of charge at zero battery power)
+keep their start values. With J = d(f, g)/d(x, z) and its pseudo-inverse J^+,
 
 .. math::
     \frac{d(x, z)}{d\theta} = -J^+ (f, g)_\theta + (1 - J^+ J)\, \mathrm{start}_\theta .
@@ -89,7 +89,7 @@ def _by_theta(equations: Equations, by_pu: Array, u_theta: Array) -> Array:
 
 
 def _pseudo_inverse(jacobian: Array) -> Array:
-    """Pseudo-inverse after scaling rows to unit size, so that a fast state does not hide a slow one's rank."""
+    """Pseudo-inverse after scaling rows to unit size, so that a fast state does not hide a slow one."""
     if not np.isfinite(jacobian).all():
         return np.zeros(jacobian.T.shape)
     scale = np.abs(jacobian).max(axis=1, initial=0.0)
@@ -100,7 +100,9 @@ def _pseudo_inverse(jacobian: Array) -> Array:
 def _fail(equations: Equations, residual: Array) -> None:
     dae = equations.dae
     names = [*(f"d({n})/dt" for n in dae.x_names), *(f"residual of {r.path}" for r in dae.algebraics)]
-    order = sorted(range(len(names)), key=lambda k: -abs(residual[k]) if np.isfinite(residual[k]) else -np.inf)
+    order = sorted(
+        range(len(names)), key=lambda k: -abs(residual[k]) if np.isfinite(residual[k]) else -np.inf
+    )
     worst = "\n".join(f"  {names[k]} = {residual[k]:.3g}" for k in order[:5])
     raise SimulationError(
         f"{dae.name}: no equilibrium at the first value of the waveform. Largest residuals:\n{worst}\n"

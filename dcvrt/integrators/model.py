@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dcvrt.errors import ModelError
-from dcvrt.integrators.casadi import Casadi, Stretch
+from dcvrt.integrators.casadi import Casadi, Stretch, bind
 from dcvrt.integrators.compiler import compiled
 from dcvrt.integrators.equations import Equations
 
@@ -21,22 +21,20 @@ DERIVATIVES = (1, 4, 16)
 
 
 class Mapped:
-    """A function of (t, X, Z, P, C) on `count` points with common P; results are rows, valid until the next call."""
+    """A function of (t, X, Z, P, C) on `count` points with common P; results hold until the next call."""
 
     def __init__(self, function: ca.Function, count: int) -> None:
         self.count = count
-        mapped = function if count == 1 else function.map(f"{function.name()}_{count}", "serial", count, [3], [])
-        self.arguments = [
-            np.zeros(mapped.size_in(k)[::-1]) for k in range(mapped.n_in())
-        ]
+        mapped = (
+            function if count == 1 else function.map(f"{function.name()}_{count}", "serial", count, [3], [])
+        )
+        self.arguments = [np.zeros(mapped.size_in(k)[::-1]) for k in range(mapped.n_in())]
         self.results = [np.zeros(mapped.size_out(k)[::-1]) for k in range(mapped.n_out())]
-        self.buffer, self.call = mapped.buffer()
-        for k, a in enumerate(self.arguments):
-            if a.size:
-                self.buffer.set_arg(k, memoryview(a.reshape(-1)))
-        for k, r in enumerate(self.results):
-            if r.size:
-                self.buffer.set_res(k, memoryview(r.reshape(-1)))
+        self.buffer, self.call = bind(
+            mapped,
+            dict(zip(mapped.name_in(), self.arguments, strict=True)),
+            dict(zip(mapped.name_out(), self.results, strict=True)),
+        )
 
     def __call__(self, t: Array, X: Array, Z: Array, P: Array, C: Array) -> list[Array]:
         n = len(t)
@@ -55,16 +53,18 @@ class Model:
     def __init__(self, equations: Equations, solver: Casadi) -> None:
         if equations.nz and not solver.algebraic:
             raise ModelError(
-                f"{equations.dae.name} has {equations.nz} algebraic variable(s); plugin {solver.plugin!r} takes "
-                "none. Use Casadi(plugin='rosenbrock') or 'idas'."
+                f"{equations.dae.name} has {equations.nz} algebraic variable(s); plugin {solver.plugin!r} "
+                "takes none. Use Casadi(plugin='rosenbrock') or 'idas'."
             )
         self.equations, self.solver = equations, solver
         directions = DERIVATIVES if solver.implicit and not equations.nw else ()
         interpreted = solver.interpreted or (solver.implicit and equations.nw > 0)
         if interpreted:
             functions = {f.name(): f for f in equations.functions}
-            self.backend = "CasADi interpreter (asked for)" if solver.interpreted else (
-                "CasADi interpreter (implicit method with sensitivities)"
+            self.backend = (
+                "CasADi interpreter (asked for)"
+                if solver.interpreted
+                else ("CasADi interpreter (implicit method with sensitivities)")
             )
         else:
             functions, self.backend = compiled(equations.functions, directions)

@@ -1,8 +1,8 @@
 r"""One run: smooth stretches joined by input jumps and by jumps of the automata.
 
-The loop is the same for every solver. A stretch is integrated without regard to events; guards, timers and bounds
-are then looked at on its samples; what comes first is located by integrating from the sample before it, the
-rows that are due are applied, and the next stretch starts there.
+The loop is the same for every solver. A stretch is integrated without regard to events; guards, timers and
+bounds are then looked at on its samples; what comes first is located by integrating from the sample before
+it, the rows that are due are applied, and the next stretch starts there.
 
 Across a jump at t_e with reset R, from dx/dt = f^- to f^+,
 
@@ -34,8 +34,8 @@ MAX_JUMPS_AT_ONCE = 50
 MAX_EVENTS = 10_000
 LOCATED = 1e-12
 FIRST_LOOK, LONGEST_LOOK = 0.02, 0.5
-"""A stretch after a restart is short, since what follows an event is often the next event; then it doubles, s."""
-MAX_GROUPS, MAX_POINTS = 64, 1024
+"""A stretch after a restart is short, since the next event is often near; then stretches double, s."""
+MAX_POINTS = 1024
 POINTS = tuple(sorted({2**k for k in range(11)} | {3 * 2**k for k in range(9)}))
 
 
@@ -134,20 +134,22 @@ class Run:
     # -- smooth stretches ---------------------------------------------------------------------------------
 
     def _stretch(self, limit: float) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-        """Integrate from here to `limit` or less: times, states, algebraic variables and piece of each sample."""
+        """Integrate from here to `limit` or less: time, states, algebraics and piece of each sample."""
         start, length = self.inputs.start, self.inputs.length
         while self.k + 1 < len(start) and start[self.k + 1] <= self.t:
             self.k += 1
         ahead = self.look_ahead if self.has_guards else LONGEST_LOOK
         stop = min(limit, self.t + ahead)
         last = max(int(np.searchsorted(start, stop, side="left")) - 1, self.k)
-        groups = 1 << (min(last - self.k + 1, MAX_GROUPS).bit_length() - 1)
+        groups = 1 << (min(last - self.k + 1, self.model.solver.groups).bit_length() - 1)
         inner = length[self.k + 1 : self.k + groups - 1]
         if groups > 1 and len(inner) and inner.max() > 4 * inner.min():
             groups = 1
         begin = start[self.k : self.k + groups].copy()
         begin[0] = self.t
-        finish = np.append(begin[1:], min(stop, float(start[self.k + groups - 1] + length[self.k + groups - 1])))
+        finish = np.append(
+            begin[1:], min(stop, float(start[self.k + groups - 1] + length[self.k + groups - 1]))
+        )
         longest = float((finish - begin).max())
         wanted = min(math.ceil(longest / self.save_at - 1e-6), MAX_POINTS)
         if longest / self.save_at > MAX_POINTS:
@@ -155,12 +157,17 @@ class Run:
         points = next(n for n in POINTS if n >= max(wanted, 1))
         return self._integrate(begin, finish, points)
 
-    def _integrate(self, begin: Array, finish: Array, points: int) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    def _integrate(
+        self, begin: Array, finish: Array, points: int
+    ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
         groups = len(begin)
         pieces = np.arange(self.k, self.k + groups)
-        controls = np.column_stack((np.arange(groups), begin, finish - begin, self.inputs.C[pieces]))
+        number = np.arange(groups, dtype=float)
+        controls: Array = np.column_stack((number, begin, finish - begin, self.inputs.C[pieces]))
         try:
-            X, Z = self.model.stretch(points, groups)(self.X, self.Z[: self.model.sizes["z"]], self.P, controls)
+            X, Z = self.model.stretch(points, groups)(
+                self.X, self.Z[: self.model.sizes["z"]], self.P, controls
+            )
         except ArithmeticError as error:
             raise Ended(self._failure(str(error), float(begin[0]), float(finish[-1]))) from None
         fractions = np.arange(1, points + 1) / points
@@ -178,7 +185,9 @@ class Run:
         eq = self.equations
         rates = self.model.at("flow", self.t, self.X, self.Z, self.P, self.inputs.C[self.k])[0][:, 0]
         worst = int(np.argmax(np.where(np.isfinite(rates), np.abs(rates), np.inf)))
-        modes = ", ".join(a.modes[m] for a, m in zip(eq.dae.automata, self.modes, strict=True)) or "no automaton"
+        modes = (
+            ", ".join(a.modes[m] for a, m in zip(eq.dae.automata, self.modes, strict=True)) or "no automaton"
+        )
         last = str(self.events[-1]) if self.events else "none"
         return (
             f"integration failed between {begin:.6g} and {end:.6g} s in mode {modes}: {why}; fastest state "
@@ -221,7 +230,9 @@ class Run:
             found = self._locate(row, float(signs[row]), self.t, upper, min(guess, upper))
             if found is not None and (best is None or found[0] < best[0] - SAME_INSTANT):
                 best = (*found, row)
-        if best is None:  # the samples promised a crossing that the solution does not have: go on from the next
+        if (
+            best is None
+        ):  # the samples promised a crossing that the solution does not have: go on from the next
             X, Z = self._to(sample)
             self.phases[-1].add(np.array([sample]), X[None], Z[None], np.array([self.k]))
             self._move(sample, X, Z, self.k)
@@ -246,7 +257,8 @@ class Run:
     def _locate(
         self, row: int, sign: float, low: float, high: float, guess: float
     ) -> tuple[float, Array, Array] | None:
-        """Time at which sign * guard rises through zero in [low, high]: Newton from a guess, bracketed if it strays.
+        """Time at which sign * guard rises through zero in [low, high]: Newton from a guess, bracketed if it
+        strays.
 
         None when the guard is not above zero at `high` after all.
         """
@@ -310,8 +322,8 @@ class Run:
     ) -> None:
         """Apply every row that is due at this instant, then start and stop timers.
 
-        `forced` says which guards are known to be positive or not just after this instant, since their crossing
-        was located here; `due` is a row whose timer has run out.
+        `forced` says which guards are known to be positive or not just after this instant, since their
+        crossing was located here; `due` is a row whose timer has run out.
         """
         forced = dict(forced or {})
         if self.t - self.instant > SAME_INSTANT:
@@ -385,7 +397,7 @@ class Run:
             flow = self.model.at("flow", self.t, self.X, self.Z, self.P, C)[0][:, 0]
             self.X[nx:] = (S + np.outer(moved - flow, dte)).T.ravel()
             self._make_consistent()
-        grad = {c.name: float(d) / c.scale for c, d in zip(eq.columns, dte, strict=True)}
+        grad = {c.name: float(d) / c.scale + 0.0 for c, d in zip(eq.columns, dte, strict=True)}
         tie = tuple(eq.rows[r][1].text for r in ties)
         self.events.append(
             Event(self.t, automaton.path, transition.source, transition.target, transition.text, tie, grad)

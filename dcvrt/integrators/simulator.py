@@ -27,19 +27,19 @@ Array = NDArray[np.float64]
 class Simulator:
     """Runs a system on waveforms, with forward sensitivities.
 
-    Stops (input jumps, events) and samples (`save_at`) have nothing to do with each other: samples are read from
-    the dense output of the steps that accuracy asks for.
+    Stops (input jumps, events) and samples (`save_at`) have nothing to do with each other: samples are read
+    from the dense output of the steps that accuracy asks for.
 
     Parameters
     ----------
     dae : the system, from ``Diagram.compile()``.
-    solver : :class:`~dcvrt.integrators.Casadi` options; by default the explicit pair ``erk``, or ``rosenbrock``
-        for a system with algebraic variables.
+    solver : :class:`~dcvrt.integrators.Casadi` options; by default the explicit pair ``erk``, or
+        ``rosenbrock`` for a system with algebraic variables.
     wrt : thetas of the sensitivities: parameters, and tangents that the waveforms carry. A tangent with the
         name of a parameter adds to it.
     save_at : largest distance of samples, s.
-    start : ``"equilibrium"`` at the first value of the waveform, or ``"given"``: the start values of the system
-        as they are, for systems that have no rest.
+    start : ``"equilibrium"`` at the first value of the waveform, or ``"given"``: the start values of the
+        system as they are, for systems that have no rest.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class Simulator:
         return run
 
     def attempt(self, waveform: Waveform, inputs: Inputs | None = None, **parameters: float) -> Trajectory:
-        """As a call, but a run that ends before its time is returned with its status and what there is of it."""
+        """As a call, but a run that ends before its time is returned, with its status and what there is."""
         p = self.dae.parameter_values(**parameters)
         model = self._model(any(name in waveform.tangents for name in self.wrt))
         table = self._channels(model.equations, waveform, inputs)
@@ -187,5 +187,3 @@ class Simulator:
             break_grad=breaks,
             name=name,
         )
-
-

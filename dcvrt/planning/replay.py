@@ -1,11 +1,12 @@
-"""The network-coupled ride-through check (paper: Algorithm 1, lines 3 to 7): one hosting vector in one period.
+"""The network-coupled ride-through check (paper: Algorithm 1, lines 3 to 7): one hosting vector in one
+period.
 
-The grid is rebuilt with the hosted load, every fault is simulated, and the voltage at every site drives the facility.
-Samples and replays of plans go through the same function. It takes and gives plain data, so that it can run in any
-process.
+The grid is rebuilt with the hosted load, every fault is simulated, and the voltage at every site drives the
+facility. Samples and replays of plans go through the same function. It takes and gives plain data, so that it
+can run in any process.
 
-A facility model is proportional to its size, so it runs on the base S_B = H (H = 1 pu); the size acts through the
-voltage waveform. Megawatts are shares times P = d_t H, the load that the grid sees before the fault.
+A facility model is proportional to its size, so it runs on the base S_B = H (H = 1 pu); the size acts through
+the voltage waveform. Megawatts are shares times P = d_t H, the load that the grid sees before the fault.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         `period`: {name, hour, load_scale, wind {bus: MW}, dc_factor};
         `faults`: [{bus, t_start_s, t_clear_ms, x_pu}];
         `runs`: [[mode, beta], ...]; `parameters`: {mode: {path: value}}; `criteria`: keywords of `Criteria`;
-        `keep`: True to give back the waveforms too: the voltages of all faults and, for each run, the facility
-        where its voltage margin and where its loss margin is least.
+        `keep`: True to give back the waveforms too: the voltages of all faults and, for each run, the
+        facility where its voltage margin and where its loss margin is least.
 
     Returns
     -------
@@ -74,37 +75,57 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         rows = []
         for mode in dict.fromkeys(mode for mode, _ in runs):
             betas = [beta for m, beta in runs if m == mode]
-            rows += _facility_rows(request, period.name, label, mode, betas, waveforms, hosting, period.dc_factor)
+            rows += _facility_rows(
+                request, period.name, label, mode, betas, waveforms, hosting, period.dc_factor
+            )
         answer["rows"] += rows
         answer["facility"] += len(rows)
         if keep:
             answer["waveforms"] += [
-                {"period": period.name, "fault": label, "site": site,
-                 "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)}}
-                for site, w in waveforms.items()]
+                {
+                    "period": period.name,
+                    "fault": label,
+                    "site": site,
+                    "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)},
+                }
+                for site, w in waveforms.items()
+            ]
             answer.setdefault("_waveforms", {})[label] = waveforms
     if keep:
         kept = answer.pop("_waveforms", {})
         for mode, beta in runs:
             for fault, site in _worst(answer["rows"], hosting, mode, beta):
                 run = _simulator(mode, _frozen(request["parameters"].get(mode, {})))(
-                    kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"]))
-                answer["waveforms"].append({"period": period.name, "fault": fault, "site": site, "mode": mode,
-                                            "beta": beta, "signals": _signals(run)})
+                    kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"])
+                )
+                answer["waveforms"].append(
+                    {
+                        "period": period.name,
+                        "fault": fault,
+                        "site": site,
+                        "mode": mode,
+                        "beta": beta,
+                        "signals": _signals(run),
+                    }
+                )
     return answer
 
 
-def lost_rows(request: Mapping[str, Any], status: str, failed_in: str,
-              faults: Sequence[str] | None = None) -> list[dict[str, Any]]:
+def lost_rows(
+    request: Mapping[str, Any], status: str, failed_in: str, faults: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
     """Rows that stand for runs that were not made: not ok, no margins, and the reason.
 
     `failed_in` is 'grid' when there was no waveform, 'task' when the whole task was set aside.
     """
     if faults is None:
         faults = [fault_label(f) for f in request["faults"]]
-    return [_row(request["period"]["name"], fault, int(site), mode, float(beta), float(H), status, failed_in)
-            for fault in faults for site, H in zip(request["sites"], request["hosting"], strict=True)
-            for mode, beta in request["runs"]]
+    return [
+        _row(request["period"]["name"], fault, int(site), mode, float(beta), float(H), status, failed_in)
+        for fault in faults
+        for site, H in zip(request["sites"], request["hosting"], strict=True)
+        for mode, beta in request["runs"]
+    ]
 
 
 def fault_label(fault: Mapping[str, Any]) -> str:
@@ -113,7 +134,8 @@ def fault_label(fault: Mapping[str, Any]) -> str:
 
 
 def prepare(request: Mapping[str, Any]) -> str:
-    """Make what is made once per machine: the grid simulator's code, the compiled facility of the request's first run.
+    """Make what is made once per machine: the grid simulator's code, the compiled facility of the request's
+    first run.
 
     Returns
     -------
@@ -127,44 +149,70 @@ def prepare(request: Mapping[str, Any]) -> str:
     return _simulator(mode, _frozen(request["parameters"].get(mode, {}))).backend
 
 
-# -- the two halves -----------------------------------------------------------------------------------------------
+# -- the two halves ------------------------------------------------------------------------------------------
 
 
-def _fault_runs(request: Mapping[str, Any], hosting: Mapping[int, float],
-                period: Period) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
+def _fault_runs(
+    request: Mapping[str, Any], hosting: Mapping[int, float], period: Period
+) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
     """Label, waveforms by site (None when there are none) and status of every fault."""
     from dcvrt.grid import BusFault
 
-    labels = {BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): fault_label(f)
-              for f in request["faults"]}
-    grid = _grid(request["case"], request["dynamics"], tuple(hosting), float(request["pf"]), request["redispatch"])
+    labels = {
+        BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): fault_label(f)
+        for f in request["faults"]
+    }
+    grid = _grid(
+        request["case"], request["dynamics"], tuple(hosting), float(request["pf"]), request["redispatch"]
+    )
     try:
-        found = grid.waveforms_of(hosting, period, list(labels), until=float(request["t_end_s"]),
-                                  step=float(request["step_s"]))
+        found = grid.waveforms_of(
+            hosting, period, list(labels), until=float(request["t_end_s"]), step=float(request["step_s"])
+        )
     except (SimulationError, InfeasibleError) as error:  # the operating point itself has no solution
         return [(label, None, str(error)) for label in labels.values()]
-    return [(label, found[fault].waveforms if found[fault].completed else None, found[fault].status)
-            for fault, label in labels.items()]
+    return [
+        (label, found[fault].waveforms if found[fault].completed else None, found[fault].status)
+        for fault, label in labels.items()
+    ]
 
 
-def _facility_rows(request: Mapping[str, Any], period: str, fault: str, mode: str, betas: Sequence[float],
-                   waveforms: Mapping[int, Waveform], hosting: Mapping[int, float], d: float) -> list[dict[str, Any]]:
+def _facility_rows(
+    request: Mapping[str, Any],
+    period: str,
+    fault: str,
+    mode: str,
+    betas: Sequence[float],
+    waveforms: Mapping[int, Waveform],
+    hosting: Mapping[int, float],
+    d: float,
+) -> list[dict[str, Any]]:
     """One mode at several ratings on the waveforms of one fault."""
     simulator = _simulator(mode, _frozen(request["parameters"].get(mode, {})))
     cases = [(site, beta) for site in waveforms for beta in betas]
-    result = simulator.batch([waveforms[site] for site, _ in cases],
-                             {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for _, beta in cases]},
-                             criteria=_criteria(_frozen(request["criteria"])))
+    result = simulator.batch(
+        [waveforms[site] for site, _ in cases],
+        {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for _, beta in cases]},
+        criteria=_criteria(_frozen(request["criteria"])),
+    )
     rows = []
     for (site, beta), status, found in zip(cases, result.status, result.margins, strict=True):
         row = _row(period, fault, site, mode, beta, hosting[site], status, "facility")
         row |= {"p_mw": d * hosting[site], "v_poi_min_pu": float(np.abs(waveforms[site].v).min())}
         if found is not None:
             share, modes = found.diagnostics["loss_share"], modes_passed(found.sequence)
-            row |= {"v_margin_pu": found.voltage.value, "loss_margin_share": found.loss.value,
-                    "loss_margin_mw": found.loss.value * row["p_mw"], "loss_share": share,
-                    "loss_mw": share * row["p_mw"], "ok": 1, "failed_in": "", "sequence": ">".join(modes),
-                    "battery": int("BATTERY" in modes), "diagnostics": dict(found.diagnostics)}
+            row |= {
+                "v_margin_pu": found.voltage.value,
+                "loss_margin_share": found.loss.value,
+                "loss_margin_mw": found.loss.value * row["p_mw"],
+                "loss_share": share,
+                "loss_mw": share * row["p_mw"],
+                "ok": 1,
+                "failed_in": "",
+                "sequence": ">".join(modes),
+                "battery": int("BATTERY" in modes),
+                "diagnostics": dict(found.diagnostics),
+            }
         rows.append(row)
     return rows
 
@@ -172,22 +220,27 @@ def _facility_rows(request: Mapping[str, Any], period: str, fault: str, mode: st
 def modes_passed(sequence: Sequence[str]) -> list[str]:
     """Modes in the order in which they were entered, from the event sequence of a run.
 
-    >>> modes_passed(("sup: NORMAL", "sup: NORMAL -> MIXED [v_f < V_dip]", "sup: MIXED -> NORMAL [v_f > V_back]"))
+    >>> modes_passed(("sup: NORMAL", "sup: NORMAL -> MIXED [v_f < V_dip]", "sup: MIXED -> NORMAL [calm]"))
     ['NORMAL', 'MIXED', 'NORMAL']
     """
     steps = [entry.split(": ", 1)[1].split(" [", 1)[0] for entry in sequence]
     return [step.rsplit(" -> ", 1)[-1] for step in steps]
 
 
-# -- what a process keeps -----------------------------------------------------------------------------------------
+# -- what a process keeps ------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=4)
 def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, redispatch: str) -> Grid:
     from dcvrt.grid import Grid
 
-    return Grid.from_case(case if case == "ieee118" else Path(case), sites=sites, pf=pf, dynamics=dynamics,
-                          redispatch=redispatch)
+    return Grid.from_case(
+        case if case == "ieee118" else Path(case),
+        sites=sites,
+        pf=pf,
+        dynamics=dynamics,
+        redispatch=redispatch,
+    )
 
 
 @lru_cache(maxsize=16)
@@ -216,20 +269,41 @@ def _frozen(values: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(values.items()))
 
 
-# -- rows ---------------------------------------------------------------------------------------------------------
+# -- rows ----------------------------------------------------------------------------------------------------
 
 
-def _row(period: str, fault: str, site: int, mode: str, beta: float, H: float, status: str,
-         failed_in: str) -> dict[str, Any]:
+def _row(
+    period: str, fault: str, site: int, mode: str, beta: float, H: float, status: str, failed_in: str
+) -> dict[str, Any]:
     nan = math.nan
-    return {"period": period, "fault": fault, "site": site, "mode": mode, "beta": beta, "h_mw": H, "p_mw": nan,
-            "v_margin_pu": nan, "loss_margin_share": nan, "loss_margin_mw": nan, "loss_share": nan, "loss_mw": nan,
-            "v_poi_min_pu": nan, "status": status, "ok": 0, "failed_in": failed_in, "sequence": "", "battery": 0,
-            "diagnostics": {}}
+    return {
+        "period": period,
+        "fault": fault,
+        "site": site,
+        "mode": mode,
+        "beta": beta,
+        "h_mw": H,
+        "p_mw": nan,
+        "v_margin_pu": nan,
+        "loss_margin_share": nan,
+        "loss_margin_mw": nan,
+        "loss_share": nan,
+        "loss_mw": nan,
+        "v_poi_min_pu": nan,
+        "status": status,
+        "ok": 0,
+        "failed_in": failed_in,
+        "sequence": "",
+        "battery": 0,
+        "diagnostics": {},
+    }
 
 
-def _worst(rows: Sequence[Mapping[str, Any]], hosting: Mapping[int, float], mode: str, beta: float) -> list[tuple[str, int]]:
-    """Fault and site with the least voltage margin, and with the least loss margin, at sites that host something."""
+def _worst(
+    rows: Sequence[Mapping[str, Any]], hosting: Mapping[int, float], mode: str, beta: float
+) -> list[tuple[str, int]]:
+    """Fault and site with the least voltage margin, and with the least loss margin, at sites that host
+    something."""
     good = [r for r in rows if r["ok"] and (r["mode"], r["beta"]) == (mode, beta) and hosting[r["site"]] > 0]
     if not good:
         return []
@@ -244,7 +318,7 @@ def _signals(run: Trajectory) -> dict[str, Any]:
     return kept
 
 
-# -- verdicts -----------------------------------------------------------------------------------------------------
+# -- verdicts ------------------------------------------------------------------------------------------------
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], by_site: Mapping[int, float], expected: int) -> dict[str, Any]:
@@ -259,15 +333,22 @@ def verdict(rows: Sequence[Mapping[str, Any]], by_site: Mapping[int, float], exp
     Returns
     -------
     dict
-        `passed`; `worst_voltage_margin_pu`, `worst_loss_margin_mw` (None when nothing is hosted or nothing ran);
-        `aggregate_loss_mw`: largest sum of the sites' losses in one fault and period; `worst`: where each of these
-        occurs; `n_failed`: runs that failed or are missing. With any of these the plan has not passed.
+        `passed`; `worst_voltage_margin_pu`, `worst_loss_margin_mw` (None when nothing is hosted or nothing
+        ran); `aggregate_loss_mw`: largest sum of the sites' losses in one fault and period; `worst`: where
+        each of these occurs; `n_failed`: runs that failed or are missing. With any of these the plan has not
+        passed.
     """
     here = [r for r in rows if by_site[r["site"]] > 0]
     good = [r for r in here if r["ok"]]
     n_failed = expected - len(good)
-    answer: dict[str, Any] = {"passed": n_failed == 0, "worst_voltage_margin_pu": None, "worst_loss_margin_mw": None,
-                              "aggregate_loss_mw": 0.0 if expected == 0 else None, "worst": {}, "n_failed": n_failed}
+    answer: dict[str, Any] = {
+        "passed": n_failed == 0,
+        "worst_voltage_margin_pu": None,
+        "worst_loss_margin_mw": None,
+        "aggregate_loss_mw": 0.0 if expected == 0 else None,
+        "worst": {},
+        "n_failed": n_failed,
+    }
     if not good:
         return answer
     voltage = min(good, key=lambda r: r["v_margin_pu"])
@@ -279,7 +360,12 @@ def verdict(rows: Sequence[Mapping[str, Any]], by_site: Mapping[int, float], exp
     where = ("site", "fault", "period", "sequence")
     return answer | {
         "passed": bool(n_failed == 0 and voltage["v_margin_pu"] >= 0.0 and loss["loss_margin_mw"] >= 0.0),
-        "worst_voltage_margin_pu": voltage["v_margin_pu"], "worst_loss_margin_mw": loss["loss_margin_mw"],
+        "worst_voltage_margin_pu": voltage["v_margin_pu"],
+        "worst_loss_margin_mw": loss["loss_margin_mw"],
         "aggregate_loss_mw": aggregate[at],
-        "worst": {"voltage": {key: voltage[key] for key in where}, "loss": {key: loss[key] for key in where},
-                  "aggregate": {"period": at[0], "fault": at[1]}}}
+        "worst": {
+            "voltage": {key: voltage[key] for key in where},
+            "loss": {key: loss[key] for key in where},
+            "aggregate": {"period": at[0], "fault": at[1]},
+        },
+    }

@@ -13,7 +13,8 @@ Floats = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
 
 NEAR_ZERO = 0.01
-"""Share of the upper corner that stands for 'next to nothing hosted': a site with no load has no facility to run."""
+"""Share of the upper corner that stands for 'next to nothing hosted': a site with no load has no facility to
+run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +39,20 @@ class Samples:
         return len(self.hosting)
 
 
-def sample_hosting(upper: npt.ArrayLike, n: int, seed: int, *, high_share: float = 0.5, high_from: float = 0.6,
-                   validation_share: float = 0.25) -> Samples:
+def sample_hosting(
+    upper: npt.ArrayLike,
+    n: int,
+    seed: int,
+    *,
+    high_share: float = 0.5,
+    high_from: float = 0.6,
+    validation_share: float = 0.25,
+) -> Samples:
     """Draw hosting vectors between nothing and the plan without ride-through (paper: Algorithm 1, line 2).
 
-    A scrambled Sobol sequence fills the box [0, `upper`]; the first `high_share` of the points is squeezed into
-    [`high_from`, 1] x `upper`, the high-capacity region that the plans are looked for in. Both corners of the box are
-    always there.
+    A scrambled Sobol sequence fills the box [0, `upper`]; the first `high_share` of the points is squeezed
+    into [`high_from`, 1] x `upper`, the high-capacity region that the plans are looked for in. Both corners
+    of the box are always there.
 
     Parameters
     ----------
@@ -77,8 +85,10 @@ def sample_hosting(upper: npt.ArrayLike, n: int, seed: int, *, high_share: float
     if corner.ndim != 1 or not np.isfinite(corner).all() or (corner < 0).any():
         problems.append(f"upper = {corner.tolist()}: needs one capacity of 0 MW or more for each site.")
     elif not corner.any():
-        problems.append("upper is zero at every site: there is nothing to sample. "
-                        "Way out: look at what binds the plan without ride-through, or give sampling.h_max_mw.")
+        problems.append(
+            "upper is zero at every site: there is nothing to sample. "
+            "Way out: look at what binds the plan without ride-through, or give sampling.h_max_mw."
+        )
     if n < 4:
         problems.append(f"n = {n}: needs at least 4 samples, two of them the corners of the box.")
     raise_all(problems, "sample_hosting", InputError)

@@ -7,8 +7,8 @@ Two forms are fitted to the same samples:
     .. math:: \hat m = a + \sum_j b_j d_t H_j + c\, \beta H_i - \delta
 
     with the loss margin in MW and the voltage margin in pu.
-    Differs: c is kept from going below 0 (`scipy.optimize.lsq_linear`). More converter rating never hurts a margin,
-    and with that the capacity never falls as beta rises.
+    Differs: c is kept from going below 0 (`scipy.optimize.lsq_linear`). More converter rating never hurts a
+    margin, and with that the capacity never falls as beta rises.
 
 `share`   natural variables: one fit per site, fault, mode, target and beta, the loss margin as a share of the
     import, with an intercept of its own for each period,
@@ -16,9 +16,9 @@ Two forms are fitted to the same samples:
     .. math:: \hat m_t = a_t + \sum_j b_j d_t H_j - \delta_t
 
 Both are tightened by the largest overprediction on the fitting set (eqs. (surrogate_overprediction),
-(surrogate_tightening)). A run that failed has no margin: it is left out of every fit and counted in `n_excluded`.
-Where no run of a rating and period has a margin, or too few have one for a fit, the surrogate says nothing and the
-site counts as one that does not pass (`Surrogate.unknown`).
+(surrogate_tightening)). A run that failed has no margin: it is left out of every fit and counted in
+`n_excluded`. Where no run of a rating and period has a margin, or too few have one for a fit, the surrogate
+says nothing and the site counts as one that does not pass (`Surrogate.unknown`).
 """
 
 from __future__ import annotations
@@ -38,16 +38,17 @@ Booleans = npt.NDArray[np.bool_]
 TARGETS = ("voltage", "loss")
 
 
-# -- one fit ------------------------------------------------------------------------------------------------------
+# -- one fit -------------------------------------------------------------------------------------------------
 
 
 def least_squares(x: Floats, m: Floats, not_negative: Sequence[int] = ()) -> Floats:
     """Coefficients k that minimise |x k - m|, some of them kept from going below 0.
 
-    Columns are scaled to unit length first, so that MW and pu regressors weigh alike; columns that depend on each
-    other share the effect (the solution of least norm in the scaled variables).
+    Columns are scaled to unit length first, so that MW and pu regressors weigh alike; columns that depend on
+    each other share the effect (the solution of least norm in the scaled variables).
 
-    >>> least_squares(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]), np.array([1.0, 3.0, 5.0])).round(9).tolist()
+    >>> x = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
+    >>> least_squares(x, np.array([1.0, 3.0, 5.0])).round(9).tolist()
     [1.0, 2.0]
     """
     from scipy.optimize import lsq_linear
@@ -64,7 +65,8 @@ def least_squares(x: Floats, m: Floats, not_negative: Sequence[int] = ()) -> Flo
 
 
 def overprediction(predicted: Floats, m: Floats) -> float:
-    """Largest amount by which a prediction exceeds its margin; 0 where none does. Eq. (surrogate_overprediction)."""
+    """Largest amount by which a prediction exceeds its margin; 0 where none does. Eq.
+    (surrogate_overprediction)."""
     return float(np.maximum(predicted - m, 0.0).max(initial=0.0))
 
 
@@ -99,17 +101,22 @@ def score(predicted: npt.ArrayLike, m: npt.ArrayLike) -> Scores:
         return Scores(0, *[float("nan")] * 5)
     error = guess - true
     return Scores(
-        n=len(true), mae=float(np.abs(error).mean()), rmse=float(np.sqrt((error**2).mean())),
-        worst_over=overprediction(guess, true), worst_under=overprediction(true, guess),
-        violation_rate=float(((guess >= 0.0) & (true < 0.0)).mean()))
+        n=len(true),
+        mae=float(np.abs(error).mean()),
+        rmse=float(np.sqrt((error**2).mean())),
+        worst_over=overprediction(guess, true),
+        worst_under=overprediction(true, guess),
+        violation_rate=float(((guess >= 0.0) & (true < 0.0)).mean()),
+    )
 
 
-# -- the data of one study ----------------------------------------------------------------------------------------
+# -- the data of one study -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class MarginData:
-    """Checked facility runs, one entry per (hosting vector, period, fault, site, mode, beta); arrays of one length.
+    """Checked facility runs, one entry per (hosting vector, period, fault, site, mode, beta); arrays of one
+    length.
 
     Attributes
     ----------
@@ -145,8 +152,11 @@ class MarginData:
 
     def __post_init__(self) -> None:
         n = len(self.site)
-        problems = [f"{key} has {len(value)} entries for {n} runs." for key, value in vars(self).items()
-                    if key != "sites" and len(value) != n]
+        problems = [
+            f"{key} has {len(value)} entries for {n} runs."
+            for key, value in vars(self).items()
+            if key != "sites" and len(value) != n
+        ]
         if not problems and self.hosting.shape[1] != len(self.sites):
             problems.append(f"hosting has {self.hosting.shape[1]} columns for {len(self.sites)} sites.")
         if not problems:
@@ -217,7 +227,9 @@ class Surrogate:
     def predict(self, hosting: Floats, d: Floats | float, beta: Floats | float, own: int) -> Floats:
         """Predicted margin for hosting vectors (points, sites)."""
         load = hosting * np.reshape(d, (-1, 1))
-        return np.asarray(self.intercept + load @ self.slopes + self.rating_slope * np.asarray(beta) * hosting[:, own])
+        return np.asarray(
+            self.intercept + load @ self.slopes + self.rating_slope * np.asarray(beta) * hosting[:, own]
+        )
 
 
 def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
@@ -231,7 +243,8 @@ def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
     Returns
     -------
     list of Surrogate
-        One for each site, fault, mode and target ('paper'); for each of these at every beta and period ('share').
+        One for each site, fault, mode and target ('paper'); for each of these at every beta and period
+        ('share').
 
     Raises
     ------
@@ -241,13 +254,19 @@ def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
     if method not in ("paper", "share"):
         raise InputError(f"surrogate method {method!r}: must be 'paper' or 'share'.")
     fit = _fit_paper if method == "paper" else _fit_share
-    return [surrogate for chosen in _groups(data, by_beta=method == "share") for target in TARGETS
-            for surrogate in fit(data, chosen, target)]
+    return [
+        surrogate
+        for chosen in _groups(data, by_beta=method == "share")
+        for target in TARGETS
+        for surrogate in fit(data, chosen, target)
+    ]
 
 
 def _groups(data: MarginData, by_beta: bool) -> Iterator[npt.NDArray[np.int64]]:
     """Positions of the runs that one fit is made from, in a fixed order."""
-    keys = np.rec.fromarrays([data.mode, data.site, data.fault, data.beta if by_beta else np.zeros(len(data.site))])
+    keys = np.rec.fromarrays(
+        [data.mode, data.site, data.fault, data.beta if by_beta else np.zeros(len(data.site))]
+    )
     _, group = np.unique(keys, return_inverse=True)
     order = np.argsort(group, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
@@ -261,7 +280,11 @@ def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
     m = data.margin(target, "paper")[chosen]
     fitted = data.fit[chosen] & data.ok[chosen]
     k = _coefficients(x, m, fitted, not_negative=[x.shape[1] - 1])
-    return [_tightened("paper", data, chosen, target, m, _predict(x, k), k[0], k[1:-1], k[-1], period="", beta=0.0)]
+    return [
+        _tightened(
+            "paper", data, chosen, target, m, _predict(x, k), k[0], k[1:-1], k[-1], period="", beta=0.0
+        )
+    ]
 
 
 def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate]:
@@ -275,9 +298,22 @@ def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
     fits = []
     for period in periods:
         here = data.period[chosen] == period
-        intercept = k[seen.index(period)] if period in seen else -np.inf
-        fits.append(_tightened("share", data, chosen[here], target, m[here], _predict(x[here], k), intercept, k[len(seen):], 0.0,
-                               period=period, beta=float(data.beta[chosen[0]])))
+        intercept = k[seen.index(period)] if period in seen and np.isfinite(k).all() else -np.inf
+        fits.append(
+            _tightened(
+                "share",
+                data,
+                chosen[here],
+                target,
+                m[here],
+                _predict(x[here], k),
+                intercept,
+                k[len(seen) :],
+                0.0,
+                period=period,
+                beta=float(data.beta[chosen[0]]),
+            )
+        )
     return fits
 
 
@@ -294,8 +330,19 @@ def _predict(x: Floats, k: Floats) -> Floats:
     return x @ k if np.isfinite(k).all() else np.full(len(x), -np.inf)
 
 
-def _tightened(method: str, data: MarginData, chosen: npt.NDArray[np.int64], target: str, m: Floats, predicted: Floats,
-               intercept: float, slopes: Floats, rating_slope: float, period: str, beta: float) -> Surrogate:
+def _tightened(
+    method: str,
+    data: MarginData,
+    chosen: npt.NDArray[np.int64],
+    target: str,
+    m: Floats,
+    predicted: Floats,
+    intercept: float,
+    slopes: Floats,
+    rating_slope: float,
+    period: str,
+    beta: float,
+) -> Surrogate:
     """Tighten a fit on its fitting points and put it together with the counts and scores of its points."""
     ok, fit = data.ok[chosen], data.fit[chosen]
     known = bool(np.isfinite(intercept))
@@ -306,17 +353,28 @@ def _tightened(method: str, data: MarginData, chosen: npt.NDArray[np.int64], tar
     unseen = ~fit & ok & known
     first = chosen[0]
     return Surrogate(
-        method=method, site=int(data.site[first]), fault=str(data.fault[first]), mode=str(data.mode[first]),
-        target=target, period=period, beta=beta, intercept=float(intercept - tightening), slopes=slopes,
-        rating_slope=float(rating_slope), tightening=tightening,
+        method=method,
+        site=int(data.site[first]),
+        fault=str(data.fault[first]),
+        mode=str(data.mode[first]),
+        target=target,
+        period=period,
+        beta=beta,
+        intercept=float(intercept - tightening),
+        slopes=slopes,
+        rating_slope=float(rating_slope),
+        tightening=tightening,
         unknown=tuple(sorted(set(places) - good if known else set(places))),
-        n_fit=int((fit & ok).sum()), n_excluded=int((fit & ~ok).sum()),
-        n_mixed=sum(sequences.values()) - max(sequences.values(), default=0), n_sequences=len(sequences),
+        n_fit=int((fit & ok).sum()),
+        n_excluded=int((fit & ~ok).sum()),
+        n_mixed=sum(sequences.values()) - max(sequences.values(), default=0),
+        n_sequences=len(sequences),
         scores=score(predicted[unseen] - tightening, m[unseen]),
-        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen] - tightening))
+        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen] - tightening),
+    )
 
 
-# -- summary ------------------------------------------------------------------------------------------------------
+# -- summary -------------------------------------------------------------------------------------------------
 
 
 def pooled_scores(fits: Sequence[Surrogate]) -> list[dict[str, float | int | str]]:
@@ -332,10 +390,20 @@ def pooled_scores(fits: Sequence[Surrogate]) -> list[dict[str, float | int | str
         true = np.concatenate([f.validation[1] for f in members])
         guess = np.concatenate([f.validation[2] for f in members])
         s = score(guess, true)
-        rows.append({
-            "method": method, "mode": mode, "target": target, "mae": s.mae, "rmse": s.rmse, "worst_over": s.worst_over,
-            "worst_under": s.worst_under, "violation_rate": s.violation_rate,
-            "n_fit": sum(f.n_fit for f in members), "n_validation": s.n})
+        rows.append(
+            {
+                "method": method,
+                "mode": mode,
+                "target": target,
+                "mae": s.mae,
+                "rmse": s.rmse,
+                "worst_over": s.worst_over,
+                "worst_under": s.worst_under,
+                "violation_rate": s.violation_rate,
+                "n_fit": sum(f.n_fit for f in members),
+                "n_validation": s.n,
+            }
+        )
     return rows
 
 

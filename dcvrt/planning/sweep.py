@@ -13,7 +13,8 @@ from dcvrt.planning.plan import Plan, Row
 from dcvrt.planning.surrogate import Surrogate
 
 NEVER_BINDS = 1e-9
-"""Slack, in the unit of the margin, by which a row that holds all over the box is told from one that may bind."""
+"""Slack, in the unit of the margin, by which a row that holds all over the box is told from one that may
+bind."""
 GAIN = 1e-6
 """MW by which an earlier plan must be larger to be carried over."""
 
@@ -27,8 +28,8 @@ class SweptPlan:
     method, mode, beta : what it is the plan for.
     plan : the hosting plan.
     closed : sites without a facility, each with the reason.
-    carried_from : the smaller rating that the plan was found at, or None. A plan that is feasible at a smaller
-        rating stays a candidate: more converter rating never hurts a margin.
+    carried_from : the smaller rating that the plan was found at, or None. A plan that is feasible at a
+        smaller rating stays a candidate: more converter rating never hurts a margin.
     """
 
     method: str
@@ -39,12 +40,13 @@ class SweptPlan:
     carried_from: float | None = None
 
 
-def margin_rows(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d: Mapping[str, float],
-                upper: npt.ArrayLike) -> tuple[list[Row], dict[int, str]]:
+def margin_rows(
+    fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d: Mapping[str, float], upper: npt.ArrayLike
+) -> tuple[list[Row], dict[int, str]]:
     """Rows of the hosting programme, and the sites that they close whatever the programme does.
 
-    Eq. (embedded_vrt_constraints): every margin of every open site is non-negative in every representative period.
-    Rows that hold everywhere in the box are left out.
+    Eq. (embedded_vrt_constraints): every margin of every open site is non-negative in every representative
+    period. Rows that hold everywhere in the box are left out.
 
     Parameters
     ----------
@@ -66,8 +68,10 @@ def margin_rows(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d:
             continue
         for period in (fit.period,) if fit.period else d:
             if (beta, period) in fit.unknown:
-                closed[fit.site] = (f"no margin known: every run of the fitting set failed, or too few for a fit, at fault "
-                                    f"{fit.fault}, {period}, {fit.mode}, beta {beta:g}")
+                closed[fit.site] = (
+                    f"no margin known: every run of the fitting set failed, or too few for a fit, at fault "
+                    f"{fit.fault}, {period}, {fit.mode}, beta {beta:g}"
+                )
                 break
             a, lower = fit.at(beta, d[period], sites.index(fit.site))
             if float(np.minimum(a, 0.0) @ box) >= lower + NEVER_BINDS:
@@ -80,9 +84,15 @@ def margin_rows(fits: Sequence[Surrogate], sites: Sequence[int], beta: float, d:
     return [row for row in rows if row.site not in closed], closed
 
 
-def sweep(problem: HostingProblem, fits: Sequence[Surrogate], modes: Sequence[str], betas: Sequence[float],
-          d: Mapping[str, float], upper: npt.ArrayLike,
-          progress: Callable[[str, str, float], None] = lambda method, mode, beta: None) -> Iterator[SweptPlan]:
+def sweep(
+    problem: HostingProblem,
+    fits: Sequence[Surrogate],
+    modes: Sequence[str],
+    betas: Sequence[float],
+    d: Mapping[str, float],
+    upper: npt.ArrayLike,
+    progress: Callable[[str, str, float], None] = lambda method, mode, beta: None,
+) -> Iterator[SweptPlan]:
     """Solve the hosting programme for every method, mode and rating, ratings rising.
 
     Parameters
@@ -106,7 +116,10 @@ def sweep(problem: HostingProblem, fits: Sequence[Surrogate], modes: Sequence[st
                 progress(method, mode, beta)
                 here = [f for f in fits if (f.method, f.mode) == (method, mode) and f.beta in (0.0, beta)]
                 rows, closed = margin_rows(here, sites, beta, d, box)
-                bounds = {bus: (0.0, 0.0 if bus in closed else float(high)) for bus, high in zip(sites, box, strict=True)}
+                bounds = {
+                    bus: (0.0, 0.0 if bus in closed else float(high))
+                    for bus, high in zip(sites, box, strict=True)
+                }
                 plan = problem.solve(rows=rows, bounds=bounds)
                 found = SweptPlan(method, mode, beta, plan, {**plan.closed, **closed})
                 if best is not None and best.plan.total_mw > plan.total_mw + GAIN:

@@ -1,9 +1,9 @@
 """Campaign: many independent tasks, each done once, however often the run is interrupted.
 
-A task is a piece of plain data. Its key is the hash of its canonical text, so the same question asked again finds
-the answer that is already in the store. Results are written by the parent process alone, each in one transaction
-with the task's new state. A task that raises, runs out of time or keeps killing its worker is set aside with its
-message, and the campaign goes on.
+A task is a piece of plain data. Its key is the hash of its canonical text, so the same question asked again
+finds the answer that is already in the store. Results are written by the parent process alone, each in one
+transaction with the task's new state. A task that raises, runs out of time or keeps killing its worker is set
+aside with its message, and the campaign goes on.
 """
 
 from __future__ import annotations
@@ -60,8 +60,14 @@ class Outcome:
 class Crew(Protocol):
     """Whoever does the work: gives back (task, outcome) as they come."""
 
-    def run(self, tasks: Sequence[Task], function: TaskFunction, timeout_s: float, tries: int,
-            started: Callable[[Task], int]) -> Iterator[tuple[Task, Outcome]]:
+    def run(
+        self,
+        tasks: Sequence[Task],
+        function: TaskFunction,
+        timeout_s: float,
+        tries: int,
+        started: Callable[[Task], int],
+    ) -> Iterator[tuple[Task, Outcome]]:
         """Do every task; `started` is called before each start and returns the number of starts so far."""
 
 
@@ -87,8 +93,14 @@ class Campaign:
     tries: int = 3
     progress: Progress = lambda phase, ended, total, lost: None
 
-    def run(self, phase: str, tasks: Sequence[Task], function: TaskFunction, record: Callable[[Task, Any], None],
-            record_lost: Callable[[Task, str], None]) -> list[str]:
+    def run(
+        self,
+        phase: str,
+        tasks: Sequence[Task],
+        function: TaskFunction,
+        record: Callable[[Task, Any], None],
+        record_lost: Callable[[Task, str], None],
+    ) -> list[str]:
         """Do the tasks of a phase that the store has no result of yet.
 
         Parameters
@@ -143,10 +155,15 @@ class Campaign:
                 self.store.count_attempt(key, by=-1)
             raise
         frame = self.store.tasks().set_index("hash")
-        return [f"{phase} task {key[:12]}: {frame.status[key]}: {frame.message[key]}" for key in by_key if key in lost]
+        return [
+            f"{phase} task {key[:12]}: {frame.status[key]}: {frame.message[key]}"
+            for key in by_key
+            if key in lost
+        ]
 
-    def _set_aside(self, task: Task, state: str, message: str, seconds: float,
-                   record_lost: Callable[[Task, str], None]) -> None:
+    def _set_aside(
+        self, task: Task, state: str, message: str, seconds: float, record_lost: Callable[[Task, str], None]
+    ) -> None:
         with self.store.transaction():
             record_lost(task, f"{state}: {message}")
             self.store.set_task(task.key, state, message, seconds)
@@ -156,7 +173,7 @@ def _killer(deaths: int) -> str:
     return f"its worker died {deaths} times while doing it"
 
 
-# -- in this process ----------------------------------------------------------------------------------------------
+# -- in this process -----------------------------------------------------------------------------------------
 
 
 class OutOfTime(BaseException):
@@ -165,7 +182,8 @@ class OutOfTime(BaseException):
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `OutOfTime` in the block after `seconds`, where the system has interval timers and this is the main thread."""
+    """Raise `OutOfTime` in the block after `seconds`, where the system has interval timers and this is the
+    main thread."""
     if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -195,8 +213,14 @@ def attempt(function: TaskFunction, payload: Payload) -> Outcome:
 class InProcess:
     """Does the tasks one after the other in this process."""
 
-    def run(self, tasks: Sequence[Task], function: TaskFunction, timeout_s: float, tries: int,
-            started: Callable[[Task], int]) -> Iterator[tuple[Task, Outcome]]:
+    def run(
+        self,
+        tasks: Sequence[Task],
+        function: TaskFunction,
+        timeout_s: float,
+        tries: int,
+        started: Callable[[Task], int],
+    ) -> Iterator[tuple[Task, Outcome]]:
         """See `Crew`. A task that kills the process is counted when the run is started again."""
         for task in tasks:
             started(task)
@@ -225,5 +249,3 @@ def crew_of(workers: int, scheduler: str | None = None) -> Any:
     from dcvrt.studies.cluster import Cluster
 
     return Cluster(workers, scheduler)
-
-

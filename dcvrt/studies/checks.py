@@ -1,7 +1,8 @@
-"""What a study file gets wrong that no single field can tell: fields that contradict each other, names of another file.
+"""What a study file gets wrong that no single field can tell: fields that contradict each other, names of
+another file.
 
-Everything is found before work starts. The network is read without starting the fault simulator wherever the case
-allows it.
+Everything is found before work starts. The built-in case is checked without starting the fault
+simulator; any other is read and initialised by it.
 """
 
 from __future__ import annotations
@@ -73,41 +74,73 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
         problems += [f"grid.sites: bus {bus} is listed more than once." for bus in _repeated(grid.sites)]
         for k, fault in enumerate(faults, start=1):
             if fault.bus in grid.sites:
-                problems.append(f"fault[{k}].bus = {fault.bus}: is a candidate bus; a site cannot ride through a fault at "
-                                "its own terminals. Way out: take a neighbouring bus, or drop it from grid.sites.")
+                problems.append(
+                    f"fault[{k}].bus = {fault.bus}: is a candidate bus; a site cannot ride through a fault "
+                    f"at "
+                    "its own terminals. Way out: take a neighbouring bus, or drop it from grid.sites."
+                )
             cleared = fault.t_start_s + 1e-3 * fault.t_clear_ms
             if cleared >= grid.t_end_s:
-                problems.append(f"fault[{k}]: is cleared at {cleared:g} s, after the end of the simulation at "
-                                f"{grid.t_end_s:g} s. Way out: raise grid.t_end_s.")
+                problems.append(
+                    f"fault[{k}]: is cleared at {cleared:g} s, after the end of the simulation at "
+                    f"{grid.t_end_s:g} s. Way out: raise grid.t_end_s."
+                )
         sampling: SamplingSection | None = sections.get("sampling")
-        if sampling is not None and sampling.h_max_mw is not None and len(sampling.h_max_mw) != len(grid.sites):
-            problems.append(f"sampling.h_max_mw: {len(sampling.h_max_mw)} values for {len(grid.sites)} sites.")
+        if (
+            sampling is not None
+            and sampling.h_max_mw is not None
+            and len(sampling.h_max_mw) != len(grid.sites)
+        ):
+            problems.append(
+                f"sampling.h_max_mw: {len(sampling.h_max_mw)} values for {len(grid.sites)} sites."
+            )
         if sampling is not None:
-            kept, needed = sampling.n - max(1, round(sampling.validation_share * sampling.n)), len(grid.sites) + 2
+            kept, needed = (
+                sampling.n - max(1, round(sampling.validation_share * sampling.n)),
+                len(grid.sites) + 2,
+            )
             if kept < needed:
-                problems.append(f"sampling.n = {sampling.n}: leaves {kept} hosting vectors to fit a margin of {len(grid.sites)} sites, "
-                                f"{needed} are needed. Way out: raise sampling.n or lower sampling.validation_share.")
+                problems.append(
+                    f"sampling.n = {sampling.n}: leaves {kept} hosting vectors to fit a margin of "
+                    f"{len(grid.sites)} sites, "
+                    f"{needed} are needed. Way out: raise sampling.n or lower sampling.validation_share."
+                )
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
-            problems += [f"criteria.{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."
-                         for name, value in (("window_ms", criteria.window_ms), ("loss_window_ms", criteria.loss_window_ms))
-                         if 1e-3 * value >= grid.t_end_s]
+            problems += [
+                f"criteria.{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."
+                for name, value in (
+                    ("window_ms", criteria.window_ms),
+                    ("loss_window_ms", criteria.loss_window_ms),
+                )
+                if 1e-3 * value >= grid.t_end_s
+            ]
     labels = [(fault.bus, fault.t_clear_ms) for fault in faults]
-    problems += [f"fault: two faults at bus {bus} are cleared after {ms:g} ms; results could not tell them apart."
-                 for bus, ms in _repeated(labels)]
+    problems += [
+        f"fault: two faults at bus {bus} are cleared after {ms:g} ms; results could not tell them apart."
+        for bus, ms in _repeated(labels)
+    ]
     periods: Sequence[PeriodEntry] = sections.get("period", ())
-    problems += [f"period: the name {name!r} is used more than once." for name in _repeated([p.name for p in periods])]
+    problems += [
+        f"period: the name {name!r} is used more than once." for name in _repeated([p.name for p in periods])
+    ]
     hosting: HostingSection | None = sections.get("hosting")
     if hosting is not None:
         if hosting.v_min_pu >= hosting.v_max_pu:
-            problems.append(f"hosting.v_min_pu = {hosting.v_min_pu:g}: must be below v_max_pu = {hosting.v_max_pu:g}.")
+            problems.append(
+                f"hosting.v_min_pu = {hosting.v_min_pu:g}: must be below v_max_pu = {hosting.v_max_pu:g}."
+            )
         if hosting.hours is not None and not 0 <= hosting.hours[0] < hosting.hours[1]:
-            problems.append(f"hosting.hours = {hosting.hours}: must be the first hour and the one after the last.")
+            problems.append(
+                f"hosting.hours = {hosting.hours}: must be the first hour and the one after the last."
+            )
     facility: FacilitySection | None = sections.get("facility")
     if facility is not None:
         if any(b <= a for a, b in zip(facility.beta, facility.beta[1:], strict=False)):
             problems.append(f"facility.beta = {facility.beta}: must rise from one value to the next.")
-        problems += [f"facility.modes: {mode!r} is listed more than once." for mode in _repeated(facility.modes)]
+        problems += [
+            f"facility.modes: {mode!r} is listed more than once." for mode in _repeated(facility.modes)
+        ]
     return problems
 
 
@@ -123,19 +156,27 @@ def read_network(grid: GridSection | None, folder: Path) -> tuple[Network | None
     path = folder / grid.case
     if not path.is_file():
         hint = did_you_mean(grid.case, ["ieee118"]) if path.suffix == "" else ""
-        return None, [f"grid.case = {grid.case!r}: no such file and no such built-in case.{hint} Way out: 'ieee118', or the "
-                      "path of a case with dynamic data, from the folder of the study file."]
+        return None, [
+            f"grid.case = {grid.case!r}: no such file and no such built-in case.{hint} Way out: 'ieee118', "
+            f"or the "
+            "path of a case with dynamic data, from the folder of the study file."
+        ]
     if grid.dynamics is not None and not (folder / grid.dynamics).is_file():
         return None, [f"grid.dynamics = {grid.dynamics!r}: no such file."]
     if path.suffix.lower() == ".raw" and grid.dynamics is None and not path.with_suffix(".dyr").is_file():
-        return None, [f"grid.case = {grid.case!r}: a .raw file has no dynamic data (machines, exciters, governors), without "
-                      "which no fault can be simulated. Way out: give grid.dynamics = \"FILE.dyr\", or a case that has "
-                      "both (.xlsx or .json of ANDES)."]
+        return None, [
+            f"grid.case = {grid.case!r}: a .raw file has no dynamic data (machines, exciters, governors), "
+            f"without "
+            'which no fault can be simulated. Way out: give grid.dynamics = "FILE.dyr", or a case that has '
+            "both (.xlsx or .json of ANDES)."
+        ]
     from dcvrt.grid import Grid
 
     try:
         dynamics = None if grid.dynamics is None else folder / grid.dynamics
-        return Grid.from_case(path, sites=tuple(grid.sites), dynamics=dynamics).network, []
+        opened = Grid.from_case(path, sites=tuple(grid.sites), dynamics=dynamics)
+        opened.operating_point({})  # machines are there, and power flow and initialisation have a solution
+        return opened.network, []
     except DcvrtError as error:
         return None, [f"grid.case = {grid.case!r}: {error}"]
 
@@ -145,21 +186,29 @@ def unknown_buses(sections: Mapping[str, Any], network: Network) -> list[str]:
     known = set(network.bus.tolist())
     named = [(f"grid.sites[{k}]", bus) for k, bus in enumerate(sections["grid"].sites, start=1)]
     named += [(f"fault[{k}].bus", fault.bus) for k, fault in enumerate(sections.get("fault", ()), start=1)]
-    return [f"{path} = {bus}: {network.name} has no such bus.{did_you_mean(bus, network.bus)}"
-            for path, bus in named if bus not in known]
+    return [
+        f"{path} = {bus}: {network.name} has no such bus.{did_you_mean(bus, network.bus)}"
+        for path, bus in named
+        if bus not in known
+    ]
 
 
 def unknown_hours(sections: Mapping[str, Any], year: Year, network: Network | None) -> list[str]:
     """Periods outside the hours of the profiles; wind at buses that the network does not have."""
     known = set(year.hours.tolist())
-    problems = [f"period[{k}].hour = {period.hour}: is not among the {len(year)} operating hours "
-                f"({year.hours.min()} to {year.hours.max()})."
-                for k, period in enumerate(sections.get("period", ()), start=1)
-                if isinstance(period.hour, int) and period.hour not in known]
+    problems = [
+        f"period[{k}].hour = {period.hour}: is not among the {len(year)} operating hours "
+        f"({year.hours.min()} to {year.hours.max()})."
+        for k, period in enumerate(sections.get("period", ()), start=1)
+        if isinstance(period.hour, int) and period.hour not in known
+    ]
     if network is not None:
         buses = set(network.bus.tolist())
-        problems += [f"hosting.profiles: wind at bus {bus}: {network.name} has no such bus."
-                     for bus in year.wind if bus not in buses]
+        problems += [
+            f"hosting.profiles: wind at bus {bus}: {network.name} has no such bus."
+            for bus in year.wind
+            if bus not in buses
+        ]
     return problems
 
 
@@ -174,22 +223,33 @@ def unknown_variants(facility: FacilitySection) -> list[str]:
             problems.append(f"facility.modes: no variant {mode!r}.{did_you_mean(mode, known)}")
     for mode in facility.parameters_by_mode:
         if mode not in facility.modes:
-            problems.append(f"facility.parameters_by_mode.{mode}: is not among facility.modes.{did_you_mean(mode, facility.modes)}")
+            problems.append(
+                f"facility.parameters_by_mode.{mode}: is not among "
+                f"facility.modes.{did_you_mean(mode, facility.modes)}"
+            )
     for mode in facility.modes:
         if mode not in known:
             continue
         rows = {row.path: row for row in variants.get(mode).compile().parameters if row.path not in SHARED}
-        tables = {"facility.parameters": facility.parameters,
-                  f"facility.parameters_by_mode.{mode}": facility.parameters_by_mode.get(mode, {})}
+        tables = {
+            "facility.parameters": facility.parameters,
+            f"facility.parameters_by_mode.{mode}": facility.parameters_by_mode.get(mode, {}),
+        }
         for table, values in tables.items():
             for path, value in values.items():
                 if path in SHARED:
-                    problems.append(f'{table}."{path}": is set by the study in every run and cannot be fixed here.')
+                    problems.append(
+                        f'{table}."{path}": is set by the study in every run and cannot be fixed here.'
+                    )
                 elif path not in rows:
-                    problems.append(f'{table}."{path}": variant {mode!r} has no such parameter.{did_you_mean(path, rows)}')
+                    problems.append(
+                        f'{table}."{path}": variant {mode!r} has no such parameter.{did_you_mean(path, rows)}'
+                    )
                 elif not rows[path].bounds[0] <= value <= rows[path].bounds[1]:
                     low, high = rows[path].bounds
-                    problems.append(f'{table}."{path}" = {value:g} {rows[path].unit}: is outside [{low:g}, {high:g}].')
+                    problems.append(
+                        f'{table}."{path}" = {value:g} {rows[path].unit}: is outside [{low:g}, {high:g}].'
+                    )
     return list(dict.fromkeys(problems))
 
 

@@ -1,8 +1,8 @@
 """Workers through dask.distributed: on this machine, or wherever a scheduler's address leads.
 
-As many tasks are handed out as there are workers, no more: so the time of a task counts from when it is handed out,
-and a dying worker takes one task with it. A task whose worker died is done again alone, with nothing else running
-beside it, so that no task is blamed for another's death.
+As many tasks are handed out as there are workers, no more: so the time of a task counts from when it is
+handed out, and a dying worker takes one task with it. A task whose worker died is done again alone, with
+nothing else running beside it, so that no task is blamed for another's death.
 """
 
 from __future__ import annotations
@@ -44,30 +44,47 @@ class Cluster:
         import dask
         from distributed import Client, LocalCluster
 
-        for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "tornado"):
+        for name in (
+            "distributed",
+            "distributed.nanny",
+            "distributed.worker",
+            "distributed.scheduler",
+            "tornado",
+        ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._settings = dask.config.set({
-            "distributed.scheduler.allowed-failures": 0,
-            "distributed.nanny.pre-spawn-environ": ONE_THREAD,
-            "distributed.worker.memory.terminate": False,
-        })
+        self._settings = dask.config.set(
+            {
+                "distributed.scheduler.allowed-failures": 0,
+                "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+                "distributed.worker.memory.terminate": False,
+            }
+        )
         self._main = _without_main_file()
         self._main.__enter__()
         if self.scheduler is None:
-            self._cluster = LocalCluster(n_workers=self.workers, threads_per_worker=1, processes=True,
-                                         dashboard_address=None, silence_logs=logging.CRITICAL)
+            self._cluster = LocalCluster(
+                n_workers=self.workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
             self._client = Client(self._cluster)
             return self
         try:
             self._client = Client(self.scheduler, timeout=5)
         except (OSError, ValueError, TimeoutError) as error:
             self.__exit__()
-            raise InputError(f"no dask scheduler answers at {self.scheduler!r} ({type(error).__name__}). "
-                             "Way out: start one with 'dask scheduler' and give the address that it prints.") from None
+            raise InputError(
+                f"no dask scheduler answers at {self.scheduler!r} ({type(error).__name__}). "
+                "Way out: start one with 'dask scheduler' and give the address that it prints."
+            ) from None
         if not self._client.nthreads():
             self.__exit__()
-            raise InputError(f"the scheduler at {self.scheduler!r} has no workers. "
-                             f"Way out: start some with 'dask worker {self.scheduler}'.")
+            raise InputError(
+                f"the scheduler at {self.scheduler!r} has no workers. "
+                f"Way out: start some with 'dask worker {self.scheduler}'."
+            )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -78,8 +95,14 @@ class Cluster:
         self._main.__exit__(None, None, None)
         self._settings.__exit__(None, None, None)
 
-    def run(self, tasks: Sequence[Task], function: TaskFunction, timeout_s: float, tries: int,
-            started: Callable[[Task], int]) -> Iterator[tuple[Task, Outcome]]:
+    def run(
+        self,
+        tasks: Sequence[Task],
+        function: TaskFunction,
+        timeout_s: float,
+        tries: int,
+        started: Callable[[Task], int],
+    ) -> Iterator[tuple[Task, Outcome]]:
         """See `dcvrt.studies.campaign.Crew`."""
         waiting, suspects = deque(tasks), deque[Task]()
         running: dict[Any, tuple[Task, float, int]] = {}
@@ -90,8 +113,9 @@ class Cluster:
             source = suspects if alone else waiting
             while source and len(running) < (1 if alone else self._places()):
                 task = source.popleft()
-                future = self._client.submit(attempt, function, dict(task.payload), key=f"{task.key}-{time.time_ns()}",
-                                             pure=False)
+                future = self._client.submit(
+                    attempt, function, dict(task.payload), key=f"{task.key}-{time.time_ns()}", pure=False
+                )
                 running[future] = (task, time.monotonic(), started(task))
             for future in self._ended(running, timeout_s):
                 task, begin, starts = running.pop(future)
@@ -130,7 +154,9 @@ class Cluster:
             assert isinstance(result, Outcome)
             return result
         if future.status == "pending":
-            where = [address for address, keys in self._client.processing().items() if future.key in map(str, keys)]
+            where = [
+                address for address, keys in self._client.processing().items() if future.key in map(str, keys)
+            ]
             future.cancel(force=True)
             if where:
                 self._client.restart_workers(where, timeout=60, raise_for_error=False)
@@ -146,12 +172,14 @@ class Cluster:
 def _without_main_file() -> Iterator[None]:
     """Keep spawned workers from running the user's script again.
 
-    A spawned process imports the file of `__main__`, which is the script that called `Study.run`; without a guard
-    in the script that would start the study once more in every worker. Tasks are functions of importable modules,
-    so the workers do not need it.
+    A spawned process imports the file of `__main__`, which is the script that called `Study.run`; without a
+    guard in the script that would start the study once more in every worker. Tasks are functions of
+    importable modules, so the workers do not need it.
     """
     main = sys.modules["__main__"]
-    hidden = {name: vars(main)[name] for name in ("__file__", "__spec__") if name in vars(main)}
+    hidden: dict[str, Any] = {
+        name: vars(main)[name] for name in ("__file__", "__spec__") if name in vars(main)
+    }
     vars(main).pop("__file__", None)
     main.__spec__ = None
     try:

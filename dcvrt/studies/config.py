@@ -1,7 +1,7 @@
 """The study file: what a study consists of, read from TOML, with every fault of the file reported at once.
 
-Units stand in the names (`t_clear_ms`, `h_max_mw`). What a field alone can get wrong is declared here; what only
-the fields together, or the network, can tell is in :mod:`dcvrt.studies.checks`.
+Units stand in the names (`t_clear_ms`, `h_max_mw`). What a field alone can get wrong is declared here; what
+only the fields together, or the network, can tell is in :mod:`dcvrt.studies.checks`.
 """
 
 from __future__ import annotations
@@ -33,40 +33,50 @@ class StudySection(Section):
     """`[study]`: what it is called, and the seed that every random choice follows from."""
 
     name: str = Field(min_length=1, description="title of tables, figures and the report")
-    seed: int = Field(1, ge=0, description="seed of the samples and of the split into fitting and validation")
+    seed: int = Field(
+        default=1, ge=0, description="seed of the samples and of the split into fitting and validation"
+    )
 
 
 class GridSection(Section):
     """`[grid]`: the network, where data centres may connect, and how faults are simulated."""
 
     case: str = Field(min_length=1, description="'ieee118' or the path of a case with dynamic data")
-    dynamics: str | None = Field(None, description="path of the dynamic data, where the case keeps them apart (.dyr)")
+    dynamics: str | None = Field(
+        default=None, description="path of the dynamic data, where the case keeps them apart (.dyr)"
+    )
     sites: list[int] = Field(min_length=1, description="candidate buses")
-    engine: Literal["andes"] = Field("andes", description="simulator of the fault waveforms")
-    t_end_s: Positive = Field(2.0, description="length of every fault simulation")
-    step_s: float = Field(1 / 120, gt=0, le=0.05, description="step of the fault simulation")
+    engine: Literal["andes"] = Field(default="andes", description="simulator of the fault waveforms")
+    t_end_s: Positive = Field(default=2.0, description="length of every fault simulation")
+    step_s: float = Field(default=1 / 120, gt=0, le=0.05, description="step of the fault simulation")
     redispatch: Literal["proportional", "slack"] = Field(
-        "proportional", description="who supplies the hosted load: all scheduled units, or the one at the slack bus")
+        default="proportional",
+        description="who supplies the hosted load: all scheduled units, or the one at the slack bus",
+    )
 
 
 class HostingSection(Section):
     """`[hosting]`: the operating hours and the limits of normal operation."""
 
-    profiles: str = Field("ieee118", description="'ieee118' or the path of a CSV: hour, load, dc, wind_<bus>_mw")
-    hours: list[int] | None = Field(None, min_length=2, max_length=2, description="first hour and the one after the last")
-    pf: float = Field(0.98, gt=0, le=1, description="power factor of the data centres")
-    rating_scale: Positive = Field(0.6, description="factor on every branch rating")
-    v_min_pu: Positive = Field(0.94, description="lowest voltage in normal operation")
-    v_max_pu: Positive = Field(1.06, description="highest voltage in normal operation")
+    profiles: str = Field(
+        default="ieee118", description="'ieee118' or the path of a CSV: hour, load, dc, wind_<bus>_mw"
+    )
+    hours: list[int] | None = Field(
+        default=None, min_length=2, max_length=2, description="first hour and the one after the last"
+    )
+    pf: float = Field(default=0.98, gt=0, le=1, description="power factor of the data centres")
+    rating_scale: Positive = Field(default=0.6, description="factor on every branch rating")
+    v_min_pu: Positive = Field(default=0.94, description="lowest voltage in normal operation")
+    v_max_pu: Positive = Field(default=1.06, description="highest voltage in normal operation")
 
 
 class FaultEntry(Section):
     """`[[fault]]`: a three-phase fault at a bus, cleared by itself."""
 
     bus: int = Field(description="bus at fault; not a candidate bus")
-    t_start_s: NotNegative = Field(0.2, description="inception")
-    t_clear_ms: Positive = Field(100.0, description="time from inception to clearing")
-    x_pu: Positive = Field(1e-4, description="fault reactance on the system base")
+    t_start_s: NotNegative = Field(default=0.2, description="inception")
+    t_clear_ms: Positive = Field(default=100.0, description="time from inception to clearing")
+    x_pu: Positive = Field(default=1e-4, description="fault reactance on the system base")
 
 
 class PeriodEntry(Section):
@@ -74,7 +84,8 @@ class PeriodEntry(Section):
 
     name: str = Field(min_length=1, description="what tables call it")
     hour: int | Literal["peak", "median", "light"] = Field(
-        description="hour of the profiles, or the hour of highest, middle or lowest net load")
+        description="hour of the profiles, or the hour of highest, middle or lowest net load"
+    )
 
 
 class FacilitySection(Section):
@@ -82,52 +93,78 @@ class FacilitySection(Section):
 
     modes: list[str] = Field(default=["gfl", "gfm"], min_length=1, description="facility variants")
     beta: list[Positive] = Field(
-        default=[1.0, 1.05, 1.1, 1.15, 1.2, 1.25, 1.3, 1.35, 1.4, 1.45, 1.5], min_length=1,
-        description="converter ratings over hosted capacity, rising")
-    parameters: dict[str, Finite] = Field(default={}, description="values other than the default, by path, all modes")
+        default=[1.0, 1.05, 1.1, 1.15, 1.2, 1.25, 1.3, 1.35, 1.4, 1.45, 1.5],
+        min_length=1,
+        description="converter ratings over hosted capacity, rising",
+    )
+    parameters: dict[str, Finite] = Field(
+        default={}, description="values other than the default, by path, all modes"
+    )
     parameters_by_mode: dict[str, dict[str, Finite]] = Field(
-        default={}, description="values for one mode only; the report lists them")
+        default={}, description="values for one mode only; the report lists them"
+    )
 
 
 class CriteriaSection(Section):
     """`[criteria]`: what riding through means."""
 
-    v_it_min_pu: Positive = Field(0.90, description="lowest sustained voltage of the protected bus")
-    window_ms: Positive = Field(20.0, description="how long the voltage must stay below to count as sustained")
-    loss_share: Share = Field(0.25, description="largest loss of import, as a share of the import before the fault")
-    loss_window_ms: NotNegative = Field(40.0, description="how long a loss must last to count; 0: the instantaneous peak")
+    v_it_min_pu: Positive = Field(default=0.90, description="lowest sustained voltage of the protected bus")
+    window_ms: Positive = Field(
+        default=20.0, description="how long the voltage must stay below to count as sustained"
+    )
+    loss_share: Share = Field(
+        default=0.25, description="largest loss of import, as a share of the import before the fault"
+    )
+    loss_window_ms: NotNegative = Field(
+        default=40.0, description="how long a loss must last to count; 0: the instantaneous peak"
+    )
     voltage_criterion: Literal["sustained", "instantaneous"] = Field(
-        "sustained", description="'instantaneous' is the plain minimum, as the paper prints it")
+        default="sustained", description="'instantaneous' is the plain minimum, as the paper prints it"
+    )
 
 
 class SamplingSection(Section):
     """`[sampling]`: the hosting vectors that the surrogates learn from."""
 
-    n: int = Field(24, ge=6, le=4096, description="number of hosting vectors")
-    validation_share: Share = Field(0.25, description="share of them kept out of the fit")
-    high_share: float = Field(0.5, ge=0, le=1, description="share of them drawn from the high-capacity region")
-    high_from: float = Field(0.6, ge=0, lt=1, description="where that region starts, as a share of the sampled box")
+    n: int = Field(default=24, ge=6, le=4096, description="number of hosting vectors")
+    validation_share: Share = Field(default=0.25, description="share of them kept out of the fit")
+    high_share: float = Field(
+        default=0.5, ge=0, le=1, description="share of them drawn from the high-capacity region"
+    )
+    high_from: float = Field(
+        default=0.6, ge=0, lt=1, description="where that region starts, as a share of the sampled box"
+    )
     h_max_mw: list[NotNegative] | None = Field(
-        None, description="upper corner of the sampled box by site; default: the plan without ride-through")
+        default=None,
+        description="upper corner of the sampled box by site; default: the plan without ride-through",
+    )
 
 
 class SurrogateSection(Section):
     """`[surrogate]`: how margins become rows of the hosting programme."""
 
-    methods: list[Literal["paper", "share"]] = Field(default=["paper", "share"], min_length=1, description="fits to compare")
+    methods: list[Literal["paper", "share"]] = Field(
+        default=["paper", "share"], min_length=1, description="fits to compare"
+    )
 
 
 class RunSection(Section):
     """`[run]`: limits of the run itself; they change no result."""
 
-    task_timeout_s: Positive = Field(600.0, description="longest time for all faults of one hosting vector and period")
-    tries: int = Field(3, ge=1, description="how often a task may kill its worker before it is set aside")
+    task_timeout_s: Positive = Field(
+        default=600.0, description="longest time for all faults of one hosting vector and period"
+    )
+    tries: int = Field(
+        default=3, ge=1, description="how often a task may kill its worker before it is set aside"
+    )
 
 
 class StudyFile(BaseModel):
     """A whole study file."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True, title="dcvrt study")
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, populate_by_name=True, title="dcvrt study"
+    )
 
     study: StudySection
     grid: GridSection
@@ -155,11 +192,13 @@ class StudyFile(BaseModel):
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})
         ends = self.period if len(self.period) < 3 else [self.period[0], self.period[-1]]
-        return self.model_copy(update={
-            "sampling": self.sampling.model_copy(update={"n": min(self.sampling.n, 10)}),
-            "facility": self.facility.model_copy(update={"beta": few}),
-            "period": ends,
-        })
+        return self.model_copy(
+            update={
+                "sampling": self.sampling.model_copy(update={"n": min(self.sampling.n, 10)}),
+                "facility": self.facility.model_copy(update={"beta": few}),
+                "period": ends,
+            }
+        )
 
 
 def template() -> str:
@@ -193,8 +232,11 @@ def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], list[
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: not a TOML file: {error}.") from None
-    problems = [f"{key}: unknown table.{did_you_mean(key, StudyFile.model_fields)}"
-                for key in raw if key not in StudyFile.model_fields]
+    problems = [
+        f"{key}: unknown table.{did_you_mean(key, StudyFile.model_fields)}"
+        for key in raw
+        if key not in StudyFile.model_fields
+    ]
     sections: dict[str, Any] = {}
     for name in StudyFile.model_fields:
         try:
@@ -225,7 +267,7 @@ def _one_field(name: str, raw: Mapping[str, Any]) -> Any:
     field = StudyFile.model_fields[name]
     if name not in raw and not field.is_required():
         return field.get_default()
-    kind = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    kind: Any = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     return TypeAdapter(kind).validate_python(raw.get(name, _Missing))
 
 
@@ -233,21 +275,39 @@ class _Missing:
     """Stands for a table that is not there: fails every validation."""
 
 
-_LIMITS = {"greater_than": ("gt", "must be above"), "greater_than_equal": ("ge", "must be at least"),
-           "less_than": ("lt", "must be below"), "less_than_equal": ("le", "must be at most")}
-_WANTED = {"string_type": "text in quotes", "int_type": "a whole number", "float_type": "a number",
-           "list_type": "a list [..]", "dict_type": "a table", "finite_number": "a finite number",
-           "model_type": "a table", "bool_type": "true or false"}
+_LIMITS = {
+    "greater_than": ("gt", "must be above"),
+    "greater_than_equal": ("ge", "must be at least"),
+    "less_than": ("lt", "must be below"),
+    "less_than_equal": ("le", "must be at most"),
+}
+_WANTED = {
+    "string_type": "text in quotes",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "list_type": "a list [..]",
+    "dict_type": "a table",
+    "finite_number": "a finite number",
+    "model_type": "a table",
+    "bool_type": "true or false",
+}
 
 
 def _sentence(name: str, raw: Mapping[str, Any], item: Mapping[str, Any]) -> str:
     """One problem, in our words: path = value: what is wrong, and the way out where one can be named."""
-    steps = [step for step in item["loc"] if step not in ("int", "constrained-str") and not str(step).startswith("literal[")]
+    steps = [
+        step
+        for step in item["loc"]
+        if step not in ("int", "constrained-str") and not str(step).startswith("literal[")
+    ]
     path = name + "".join(f"[{step + 1}]" if isinstance(step, int) else f".{step}" for step in steps)
     kind, context = item["type"], item.get("ctx", {})
     if not item["loc"] and item["input"] is _Missing:
-        return (f"{name}: at least one [[{name}]] is required." if name in ("fault", "period")
-                else f"{name}: this table is required.")
+        return (
+            f"{name}: at least one [[{name}]] is required."
+            if name in ("fault", "period")
+            else f"{name}: this table is required."
+        )
     if kind == "extra_forbidden":
         return f"{path}: unknown field.{did_you_mean(steps[-1], _known_fields(name))}"
     if kind == "missing":
@@ -257,7 +317,8 @@ def _sentence(name: str, raw: Mapping[str, Any], item: Mapping[str, Any]) -> str
         key, words = _LIMITS[kind]
         return f"{value}: {words} {context[key]:g}."
     if kind == "too_short":
-        return f"{path}: needs at least {context['min_length']} entr{'y' if context['min_length'] == 1 else 'ies'}."
+        entries = "entry" if context["min_length"] == 1 else "entries"
+        return f"{path}: needs at least {context['min_length']} {entries}."
     if kind == "too_long":
         return f"{path}: takes at most {context['max_length']} entries."
     if kind == "literal_error":
@@ -273,12 +334,16 @@ def _merged(sentences: list[str]) -> list[str]:
     for sentence in sentences:
         field, _, rule = sentence.partition(": must be ")
         merged.setdefault(field if rule else sentence, []).append(rule)
-    return [field + (": must be " + ", or ".join(rule.rstrip(".") for rule in rules) + "." if rules[0] else "")
-            for field, rules in merged.items()]
+    return [
+        field + (": must be " + ", or ".join(rule.rstrip(".") for rule in rules) + "." if rules[0] else "")
+        for field, rules in merged.items()
+    ]
 
 
 def _known_fields(name: str) -> list[str]:
-    entry: Any = {"fault": FaultEntry, "period": PeriodEntry}.get(name, StudyFile.model_fields[name].annotation)
+    entry: Any = {"fault": FaultEntry, "period": PeriodEntry}.get(
+        name, StudyFile.model_fields[name].annotation
+    )
     return [field for field in entry.model_fields]
 
 
@@ -293,8 +358,12 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such study file. Way out: 'dcvrt study new {path}' writes one to edit.") from None
+        raise InputError(
+            f"{path}: no such study file. Way out: 'dcvrt study new {path}' writes one to edit."
+        ) from None
     except IsADirectoryError:
-        raise InputError(f"{path} is a folder, not a study file. Way out: name the TOML file in it.") from None
+        raise InputError(
+            f"{path} is a folder, not a study file. Way out: name the TOML file in it."
+        ) from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}). Way out: save it as UTF-8.") from None

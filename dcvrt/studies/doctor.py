@@ -20,7 +20,10 @@ def examine() -> tuple[str, bool]:
         lines.append("  missing packages: pip install dcvrt brings all of them")
     compiler = find_compiler()
     if compiler is None:
-        lines.append(f"{'compiler':12} none: facility models are interpreted, several times slower, with the same numbers")
+        lines.append(
+            f"{'compiler':12} none: facility models are interpreted, several times slower, with the same "
+            f"numbers"
+        )
         lines.append("  way out: install gcc or clang, or pip install 'dcvrt[compiler]'")
     else:
         lines.append(f"{'compiler':12} {compiler}")
@@ -28,6 +31,8 @@ def examine() -> tuple[str, bool]:
     if found["andes"] != "not installed":
         from dcvrt.grid import andes
 
-        state = "ready" if andes.prepared() else "generated at the first fault simulation, up to half a minute"
+        state = (
+            "ready" if andes.prepared() else "generated at the first fault simulation, up to half a minute"
+        )
         lines.append(f"{'andes code':12} {state} ({andes.code_folder()})")
     return "\n".join(lines), healthy

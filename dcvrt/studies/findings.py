@@ -300,7 +300,7 @@ class Findings:
         if replayed.empty:
             return None
         least = replayed[["v_margin_pu", "loss_margin_share"]].min(axis=1)
-        row = replayed.loc[least.idxmin()]
+        row = replayed.iloc[int(least.to_numpy().argmin())]
         return Case(
             str(row.hosting),
             str(row.period),
@@ -386,7 +386,10 @@ def binding_text(entry: Row) -> str:
     text = str(entry["label"]) if entry["kind"] == "row" else f"{entry['kind']} {entry['label']}"
     if entry.get("hour") is not None:
         text += f" in hour {entry['hour']}"
-    return f"{text} ({entry['price']:.3g} {entry['unit']})" if entry.get("price") else text
+    price = entry.get("price")
+    if not price:
+        return text
+    return f"{text} ({f'{price:,.0f}' if price >= 100 else f'{price:.3g}'} {entry['unit']})"
 
 
 def by_site(row: Row, sites: Sequence[int]) -> list[float]:

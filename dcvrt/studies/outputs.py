@@ -1,4 +1,5 @@
-"""What a study folder holds for people and programs, made from the store alone: summary.json, table.csv, validation.csv.
+"""What a study folder holds for people and programs, made from the store alone: summary.json, table.csv,
+validation.csv.
 
 Each file is written beside itself and then moved into place: a file that is there is whole.
 """
@@ -13,12 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
-from dcvrt.studies.store import Store
+from dcvrt.studies.store import Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
 
-STORE, SUMMARY, TABLE, VALIDATION, STUDY = "study.sqlite", "summary.json", "table.csv", "validation.csv", "study.toml"
+STORE, SUMMARY, TABLE, VALIDATION, STUDY = (
+    "study.sqlite",
+    "summary.json",
+    "table.csv",
+    "validation.csv",
+    "study.toml",
+)
 
 
 def write_atomically(path: Path, text: str) -> Path:
@@ -43,34 +50,58 @@ def write_results(folder: Path, store: Store) -> list[Path]:
 
 def summary(store: Store) -> dict[str, Any]:
     """The result of a study as plain data; its keys are fixed."""
-    plans = store.plans().to_dict("records")
+    plans = records(store.plans())
     known = store.provenance()
     none = next(plan for plan in plans if plan["method"] == "none")
-    return _clean({
-        "no_vrt": {"total_mw": none["total_mw"], "by_site": none["by_site"]},
-        "rows": [_plan(plan, known["engine"]) for plan in plans if plan["method"] != "none"],
-        "surrogate": surrogate_scores(store),
-        "simulations": simulations(store),
-        "wall_s": known.get("wall_s", 0.0),
-        "versions": known["versions"],
-    })
+    return _clean(
+        {
+            "no_vrt": {"total_mw": none["total_mw"], "by_site": none["by_site"]},
+            "rows": [_plan(plan, known["engine"]) for plan in plans if plan["method"] != "none"],
+            "surrogate": surrogate_scores(store),
+            "simulations": simulations(store),
+            "wall_s": known.get("wall_s", 0.0),
+            "versions": known["versions"],
+        }
+    )
 
 
 def _plan(plan: Mapping[str, Any], engine: str) -> dict[str, Any]:
     return {
-        "mode": plan["mode"], "beta": plan["beta"], "method": plan["method"], "total_mw": plan["total_mw"],
-        "by_site": plan["by_site"], "binding": binding(plan),
-        "replay": {"engine": engine, "passed": bool(plan["passed"]),
-                   **{key: plan[key] for key in ("worst_voltage_margin_pu", "worst_loss_margin_mw", "aggregate_loss_mw")}},
-        "ac": {"passed": bool(plan["ac_passed"]), "v_min_pu": plan["ac_v_min_pu"], "v_error_pu": plan["ac_v_error_pu"]},
+        "mode": plan["mode"],
+        "beta": plan["beta"],
+        "method": plan["method"],
+        "total_mw": plan["total_mw"],
+        "by_site": plan["by_site"],
+        "binding": binding(plan),
+        "replay": {
+            "engine": engine,
+            "passed": bool(plan["passed"]),
+            **{
+                key: plan[key]
+                for key in ("worst_voltage_margin_pu", "worst_loss_margin_mw", "aggregate_loss_mw")
+            },
+        },
+        "ac": {
+            "passed": bool(plan["ac_passed"]),
+            "v_min_pu": plan["ac_v_min_pu"],
+            "v_error_pu": plan["ac_v_error_pu"],
+        },
     }
 
 
 def binding(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What keeps a plan from hosting more, and the sites that it closes, each with the reason."""
     carried = plan["carried_from"]
-    found: list[dict[str, Any]] = [] if carried is None or carried != carried else [
-        {"kind": "carried", "label": f"found at beta {carried:g}: larger than the fits of this beta allow by themselves"}]
+    found: list[dict[str, Any]] = (
+        []
+        if carried is None or carried != carried
+        else [
+            {
+                "kind": "carried",
+                "label": f"found at beta {carried:g}: larger than the fits of this beta allow by themselves",
+            }
+        ]
+    )
     found += [dict(item) for item in plan["binding"]]
     return found + [{"kind": "closed", "bus": int(bus), "label": why} for bus, why in plan["closed"].items()]
 
@@ -82,9 +113,20 @@ def surrogate_scores(store: Store) -> list[dict[str, Any]]:
     for (method, mode, target), fitted in fits.groupby(["method", "mode", "target"], sort=True):
         here = points[(points.method == method) & (points["mode"] == mode) & (points.target == target)]
         s = score(here.predicted.to_numpy(), here.margin.to_numpy())
-        rows.append({"method": method, "mode": mode, "target": target, "mae": s.mae, "rmse": s.rmse,
-                     "worst_over": s.worst_over, "worst_under": s.worst_under, "violation_rate": s.violation_rate,
-                     "n_fit": int(fitted.n_fit.sum()), "n_validation": s.n})
+        rows.append(
+            {
+                "method": method,
+                "mode": mode,
+                "target": target,
+                "mae": s.mae,
+                "rmse": s.rmse,
+                "worst_over": s.worst_over,
+                "worst_under": s.worst_under,
+                "violation_rate": s.violation_rate,
+                "n_fit": int(fitted.n_fit.sum()),
+                "n_validation": s.n,
+            }
+        )
     return rows
 
 
@@ -96,30 +138,45 @@ def simulations(store: Store) -> dict[str, int]:
     margins, tasks = store.margins(), store.tasks()
     faults = margins[margins.failed_in != "task"].drop_duplicates(["hosting", "period", "fault"])
     ran = margins[margins.failed_in.isin(["", "facility"])]
-    return {"grid": len(faults), "facility": len(ran),
-            "failed": int((faults.failed_in == "grid").sum() + (ran.failed_in == "facility").sum()),
-            "quarantined": int(tasks.status.isin(LOST).sum())}
+    return {
+        "grid": len(faults),
+        "facility": len(ran),
+        "failed": int((faults.failed_in == "grid").sum() + (ran.failed_in == "facility").sum()),
+        "quarantined": int(tasks.status.isin(LOST).sum()),
+    }
 
 
 def plan_table(store: Store) -> pd.DataFrame:
-    """One row per plan, the one without ride-through first: capacities, verdicts, what is worst and what closes."""
+    """One row per plan, the one without ride-through first: capacities, verdicts, what is worst and what
+    closes."""
     import pandas as pd
 
     rows = []
-    plans = store.plans().to_dict("records")
+    plans = records(store.plans())
     for plan in sorted(plans, key=lambda p: (p["method"] != "none", p["method"], p["mode"], p["beta"])):
         vrt = plan["method"] != "none"
         worst = plan["worst"]
-        rows.append({
-            "method": plan["method"] if vrt else "no ride-through", "mode": plan["mode"],
-            "beta": plan["beta"] if vrt else None, "total_mw": plan["total_mw"],
-            **{f"bus_{bus}_mw": mw for bus, mw in plan["by_site"].items()},
-            "replay": verdict_word(plan) if vrt else "", "worst_voltage_margin_pu": plan["worst_voltage_margin_pu"],
-            "worst_loss_margin_mw": plan["worst_loss_margin_mw"], "aggregate_loss_mw": plan["aggregate_loss_mw"],
-            "failed_runs": plan["n_failed"], "worst_voltage_at": _place(worst.get("voltage")),
-            "worst_loss_at": _place(worst.get("loss")), "ac": "passed" if plan["ac_passed"] else "failed",
-            "ac_v_min_pu": plan["ac_v_min_pu"], "ac_v_error_pu": plan["ac_v_error_pu"],
-            "closed_sites": " ".join(plan["closed"]), "carried_from_beta": plan["carried_from"]})
+        rows.append(
+            {
+                "method": plan["method"] if vrt else "no ride-through",
+                "mode": plan["mode"],
+                "beta": plan["beta"] if vrt else None,
+                "total_mw": plan["total_mw"],
+                **{f"bus_{bus}_mw": mw for bus, mw in plan["by_site"].items()},
+                "replay": verdict_word(plan) if vrt else "",
+                "worst_voltage_margin_pu": plan["worst_voltage_margin_pu"],
+                "worst_loss_margin_mw": plan["worst_loss_margin_mw"],
+                "aggregate_loss_mw": plan["aggregate_loss_mw"],
+                "failed_runs": plan["n_failed"],
+                "worst_voltage_at": _place(worst.get("voltage")),
+                "worst_loss_at": _place(worst.get("loss")),
+                "ac": "passed" if plan["ac_passed"] else "failed",
+                "ac_v_min_pu": plan["ac_v_min_pu"],
+                "ac_v_error_pu": plan["ac_v_error_pu"],
+                "closed_sites": " ".join(plan["closed"]),
+                "carried_from_beta": plan["carried_from"],
+            }
+        )
     return pd.DataFrame(rows)
 
 

@@ -1,4 +1,5 @@
-"""The phases of a study (paper: Algorithm 1): samples, fits, plans, replays. Each reads and writes the store only."""
+"""The phases of a study (paper: Algorithm 1): samples, fits, plans, replays. Each reads and writes the store
+only."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from dcvrt.planning.surrogate import MarginData, Surrogate, fit_surrogates
 from dcvrt.planning.sweep import sweep
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.config import StudyFile
-from dcvrt.studies.store import Store
+from dcvrt.studies.store import Store, records
 
 SAMPLES, REPLAYS = "samples", "replays"
 NO_VRT = "none"
@@ -60,32 +61,53 @@ class Setting:
         """The sampled hosting vectors."""
         s = self.file.sampling
         corner = s.h_max_mw or [self.no_vrt.by_site[bus] for bus in self.sites]
-        return sample_hosting(corner, s.n, self.file.study.seed, high_share=s.high_share, high_from=s.high_from,
-                              validation_share=s.validation_share)
+        return sample_hosting(
+            corner,
+            s.n,
+            self.file.study.seed,
+            high_share=s.high_share,
+            high_from=s.high_from,
+            validation_share=s.validation_share,
+        )
 
-    def request(self, hosting: Sequence[float], period: str, runs: Sequence[tuple[str, float]], keep: bool) -> dict[str, Any]:
+    def request(
+        self, hosting: Sequence[float], period: str, runs: Sequence[tuple[str, float]], keep: bool
+    ) -> dict[str, Any]:
         """The request of `dcvrt.planning.replay.check_hosting` for one hosting vector and period."""
         grid, f = self.file.grid, self.file.facility
         path = grid.case if grid.case == "ieee118" else str((self.folder / grid.case).resolve())
         dynamics = None if grid.dynamics is None else str((self.folder / grid.dynamics).resolve())
         return {
-            "case": path, "dynamics": dynamics, "sites": list(self.sites), "pf": self.file.hosting.pf,
-            "redispatch": grid.redispatch, "step_s": grid.step_s, "t_end_s": grid.t_end_s,
-            "hosting": [float(mw) for mw in hosting], "period": self.periods[period],
-            "faults": [fault.model_dump() for fault in self.file.fault], "runs": [list(run) for run in runs],
+            "case": path,
+            "dynamics": dynamics,
+            "sites": list(self.sites),
+            "pf": self.file.hosting.pf,
+            "redispatch": grid.redispatch,
+            "step_s": grid.step_s,
+            "t_end_s": grid.t_end_s,
+            "hosting": [float(mw) for mw in hosting],
+            "period": self.periods[period],
+            "faults": [fault.model_dump() for fault in self.file.fault],
+            "runs": [list(run) for run in runs],
             "parameters": {mode: f.parameters | f.parameters_by_mode.get(mode, {}) for mode, _ in runs},
-            "criteria": criteria(self.file), "keep": keep,
+            "criteria": criteria(self.file),
+            "keep": keep,
         }
 
 
 def criteria(file: StudyFile) -> dict[str, Any]:
     """Keywords of `Criteria`."""
     c = file.criteria
-    return {"v_it_min": c.v_it_min_pu, "window": 1e-3 * c.window_ms, "loss_share": c.loss_share,
-            "loss_window": 1e-3 * c.loss_window_ms, "criterion": c.voltage_criterion}
+    return {
+        "v_it_min": c.v_it_min_pu,
+        "window": 1e-3 * c.window_ms,
+        "loss_share": c.loss_share,
+        "loss_window": 1e-3 * c.loss_window_ms,
+        "criterion": c.voltage_criterion,
+    }
 
 
-# -- simulation campaigns -----------------------------------------------------------------------------------------
+# -- simulation campaigns ------------------------------------------------------------------------------------
 
 
 def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
@@ -93,9 +115,18 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
     samples, store = setting.samples(), campaign.store
     runs = [(mode, beta) for mode in setting.file.facility.modes for beta in setting.file.facility.beta]
     with store.transaction():
-        store.put("hostings", [
-            _hosting(f"s{k:04}", "sample", "fit" if samples.fit[k] else "validation", dict(zip(setting.sites, H, strict=True)))
-            for k, H in enumerate(samples.hosting.tolist())])
+        store.put(
+            "hostings",
+            [
+                _hosting(
+                    f"s{k:04}",
+                    "sample",
+                    "fit" if samples.fit[k] else "validation",
+                    dict(zip(setting.sites, H, strict=True)),
+                )
+                for k, H in enumerate(samples.hosting.tolist())
+            ],
+        )
         store.note(sampled_box_mw=dict(zip(map(str, setting.sites), samples.upper.tolist(), strict=True)))
     work = {f"s{k:04}": H for k, H in enumerate(samples.hosting.tolist())}
     return _simulate(campaign, SAMPLES, setting, [(name, H, runs) for name, H in work.items()], keep=False)
@@ -104,28 +135,38 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
 def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     """Simulate every plan that hosts anything, each hosting vector once; then write the verdicts."""
     store = campaign.store
-    plans = [p for p in store.plans().to_dict("records") if p["method"] != NO_VRT]
+    plans = [p for p in records(store.plans()) if p["method"] != NO_VRT]
     wanted: dict[str, tuple[list[float], set[tuple[str, float]]]] = {}
     for plan in plans:
         if plan["total_mw"] > 0:
             H = [plan["by_site"][str(bus)] for bus in setting.sites]
             wanted.setdefault(plan["hosting"], (H, set()))[1].add((plan["mode"], plan["beta"]))
-    lost = _simulate(campaign, REPLAYS, setting,
-                     [(name, H, sorted(runs)) for name, (H, runs) in wanted.items()], keep=True)
+    lost = _simulate(
+        campaign, REPLAYS, setting, [(name, H, sorted(runs)) for name, (H, runs) in wanted.items()], keep=True
+    )
     margins = store.margins("plan")
     with store.transaction():
         for plan in plans:
             by_site = {int(bus): mw for bus, mw in plan["by_site"].items()}
-            rows = margins[(margins.hosting == plan["hosting"]) & (margins["mode"] == plan["mode"])
-                           & (margins.beta == plan["beta"])].to_dict("records")
+            here = (
+                (margins.hosting == plan["hosting"])
+                & (margins["mode"] == plan["mode"])
+                & (margins.beta == plan["beta"])
+            )
+            rows = records(margins[here])
             is_open = sum(mw > 0 for mw in by_site.values())
             expected = is_open * len(setting.periods) * len(setting.file.fault)
             store.put("plans", [plan | replay.verdict(rows, by_site, expected) | {"replayed": 1}])
     return lost
 
 
-def _simulate(campaign: Campaign, phase: str, setting: Setting,
-              work: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]], keep: bool) -> list[str]:
+def _simulate(
+    campaign: Campaign,
+    phase: str,
+    setting: Setting,
+    work: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]],
+    keep: bool,
+) -> list[str]:
     """One task for each hosting vector and period."""
     store = campaign.store
     names: dict[str, str] = {}
@@ -149,7 +190,7 @@ def _simulate(campaign: Campaign, phase: str, setting: Setting,
     return campaign.run(phase, tasks, replay.check_hosting, record, record_lost)
 
 
-# -- fits ---------------------------------------------------------------------------------------------------------
+# -- fits ----------------------------------------------------------------------------------------------------
 
 
 def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> MarginData:
@@ -160,14 +201,22 @@ def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> M
     samples = store.hostings().set_index("name")
     vectors = {name: [by_site[str(bus)] for bus in sites] for name, by_site in samples.by_site.items()}
     return MarginData(
-        sites=tuple(sites), hosting=np.array([vectors[name] for name in frame.hosting]),
-        d=np.array([d[name] for name in frame.period]), period=frame.period.to_numpy(dtype=str),
-        fault=frame.fault.to_numpy(dtype=str), mode=frame["mode"].to_numpy(dtype=str),
-        site=frame.site.to_numpy(dtype=np.int64), beta=frame.beta.to_numpy(dtype=float),
-        voltage=frame.v_margin_pu.to_numpy(dtype=float), loss_share=frame.loss_margin_share.to_numpy(dtype=float),
-        loss_mw=frame.loss_margin_mw.to_numpy(dtype=float), ok=frame.ok.to_numpy(dtype=bool),
+        sites=tuple(sites),
+        hosting=np.array([vectors[name] for name in frame.hosting]),
+        d=np.array([d[name] for name in frame.period]),
+        period=frame.period.to_numpy(dtype=str),
+        fault=frame.fault.to_numpy(dtype=str),
+        mode=frame["mode"].to_numpy(dtype=str),
+        site=frame.site.to_numpy(dtype=np.int64),
+        beta=frame.beta.to_numpy(dtype=float),
+        voltage=frame.v_margin_pu.to_numpy(dtype=float),
+        loss_share=frame.loss_margin_share.to_numpy(dtype=float),
+        loss_mw=frame.loss_margin_mw.to_numpy(dtype=float),
+        ok=frame.ok.to_numpy(dtype=bool),
         sequence=frame.sequence.to_numpy(dtype=str),
-        fit=(samples.subset[frame.hosting] == "fit").to_numpy(dtype=bool), name=frame.hosting.to_numpy(dtype=str))
+        fit=(samples.subset[frame.hosting] == "fit").to_numpy(dtype=bool),
+        name=frame.hosting.to_numpy(dtype=str),
+    )
 
 
 def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
@@ -177,30 +226,68 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
     with store.transaction():
         store.clear("surrogates", "predictions")
         for fit in fits:
-            key = {name: getattr(fit, name) for name in ("method", "mode", "site", "fault", "target", "period", "beta")}
+            key = {
+                name: getattr(fit, name)
+                for name in ("method", "mode", "site", "fault", "target", "period", "beta")
+            }
             scores = {name: value for name, value in asdict(fit.scores).items() if name != "n"}
-            store.put("surrogates", [key | scores | {
-                "intercept": fit.intercept, "slopes": dict(zip(map(str, setting.sites), fit.slopes.tolist(), strict=True)),
-                "rating_slope": fit.rating_slope, "tightening": fit.tightening, "unknown": [list(place) for place in fit.unknown], "n_fit": fit.n_fit,
-                "n_validation": fit.scores.n, "n_excluded": fit.n_excluded, "n_mixed": fit.n_mixed,
-                "n_sequences": fit.n_sequences}])
+            store.put(
+                "surrogates",
+                [
+                    key
+                    | scores
+                    | {
+                        "intercept": fit.intercept,
+                        "slopes": dict(zip(map(str, setting.sites), fit.slopes.tolist(), strict=True)),
+                        "rating_slope": fit.rating_slope,
+                        "tightening": fit.tightening,
+                        "unknown": [list(place) for place in fit.unknown],
+                        "n_fit": fit.n_fit,
+                        "n_validation": fit.scores.n,
+                        "n_excluded": fit.n_excluded,
+                        "n_mixed": fit.n_mixed,
+                        "n_sequences": fit.n_sequences,
+                    }
+                ],
+            )
             names, margins, predicted = fit.validation
             # Pooled fits hold a hosting vector several times: number the points within each.
-            store.put("predictions", [
-                key | {"hosting": str(name), "point": k, "margin": float(m), "predicted": float(p)}
-                for k, (name, m, p) in enumerate(zip(names, margins, predicted, strict=True))])
+            store.put(
+                "predictions",
+                [
+                    key | {"hosting": str(name), "point": k, "margin": float(m), "predicted": float(p)}
+                    for k, (name, m, p) in enumerate(zip(names, margins, predicted, strict=True))
+                ],
+            )
     return fits
 
 
-# -- plans --------------------------------------------------------------------------------------------------------
+# -- plans ---------------------------------------------------------------------------------------------------
 
 
 def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progress: Any) -> None:
     """Solve the hosting programme for every method, mode and rating, and check each plan by AC power flow."""
     file = setting.file
-    digest = hashlib.sha256(json.dumps([[fit.method, fit.mode, fit.site, fit.fault, fit.target, fit.period, fit.beta,
-                                         fit.intercept, *fit.slopes.tolist(), fit.rating_slope, fit.unknown] for fit in fits])
-                            .encode()).hexdigest()
+    digest = hashlib.sha256(
+        json.dumps(
+            [
+                [
+                    fit.method,
+                    fit.mode,
+                    fit.site,
+                    fit.fault,
+                    fit.target,
+                    fit.period,
+                    fit.beta,
+                    fit.intercept,
+                    *fit.slopes.tolist(),
+                    fit.rating_slope,
+                    fit.unknown,
+                ]
+                for fit in fits
+            ]
+        ).encode()
+    ).hexdigest()
     if store.provenance().get("plans_from") == digest:
         return
     upper = setting.samples().upper
@@ -208,8 +295,14 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
     rows = [_plan_row(setting, NO_VRT, "", 0.0, setting.no_vrt, setting.no_vrt.closed, None)]
     checked: dict[str, dict[str, Any]] = {}
     found = []
-    for k, swept in enumerate(sweep(setting.problem, fits, file.facility.modes, file.facility.beta, setting.d, upper), 1):
-        rows.append(_plan_row(setting, swept.method, swept.mode, swept.beta, swept.plan, swept.closed, swept.carried_from))
+    for k, swept in enumerate(
+        sweep(setting.problem, fits, file.facility.modes, file.facility.beta, setting.d, upper), 1
+    ):
+        rows.append(
+            _plan_row(
+                setting, swept.method, swept.mode, swept.beta, swept.plan, swept.closed, swept.carried_from
+            )
+        )
         found.append(swept.plan)
         progress("plans", k, total, 0)
     for row, plan in zip(rows, [setting.no_vrt, *found], strict=True):
@@ -218,18 +311,46 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
         row |= checked[row["hosting"]]
     with store.transaction():
         store.clear("plans")
-        store.put("hostings", [_hosting(row["hosting"], "plan", "", {int(b): mw for b, mw in row["by_site"].items()})
-                               for row in rows])
+        store.put(
+            "hostings",
+            [
+                _hosting(row["hosting"], "plan", "", {int(b): mw for b, mw in row["by_site"].items()})
+                for row in rows
+            ],
+        )
         store.put("plans", rows)
         store.note(plans_from=digest)
 
 
-def _plan_row(setting: Setting, method: str, mode: str, beta: float, plan: Plan, closed: Mapping[int, str],
-              carried_from: float | None) -> dict[str, Any]:
+def _plan_row(
+    setting: Setting,
+    method: str,
+    mode: str,
+    beta: float,
+    plan: Plan,
+    closed: Mapping[int, str],
+    carried_from: float | None,
+) -> dict[str, Any]:
     H = {str(bus): round(plan.by_site[bus], 6) + 0.0 for bus in setting.sites}
-    binding = [asdict(b) for b in plan.binding]
-    return {"method": method, "mode": mode, "beta": beta, "hosting": _plan_name(H), "total_mw": sum(H.values()), "by_site": H,
-            "binding": binding, "closed": {str(bus): why for bus, why in closed.items()}, "carried_from": carried_from}
+    # A closed site is told as such, not as one whose largest size is 0; other bounds are those of the sampled
+    # box.
+    binding = [
+        asdict(b)
+        | ({"label": f"sampled box at site {b.bus}"} if b.kind == "bound" and method != NO_VRT else {})
+        for b in plan.binding
+        if not (b.kind == "bound" and b.bus in closed)
+    ]
+    return {
+        "method": method,
+        "mode": mode,
+        "beta": beta,
+        "hosting": _plan_name(H),
+        "total_mw": sum(H.values()),
+        "by_site": H,
+        "binding": binding,
+        "closed": {str(bus): why for bus, why in closed.items()},
+        "carried_from": carried_from,
+    }
 
 
 def _plan_name(by_site: Mapping[str, float]) -> str:
@@ -237,15 +358,25 @@ def _plan_name(by_site: Mapping[str, float]) -> str:
 
 
 def _ac(problem: HostingProblem, plan: Plan) -> dict[str, Any]:
-    """Power-flow verdict of a plan; a power flow that cannot be made is a failed verdict, not a missing one."""
+    """Power-flow verdict of a plan; a power flow that cannot be made is a failed verdict, not a missing
+    one."""
     try:
         seen = problem.check_ac(plan)
     except DcvrtError as error:
         return {"ac_passed": 0, "ac_v_min_pu": None, "ac_v_error_pu": None, "ac_status": str(error)}
-    return {"ac_passed": int(seen.passed), "ac_v_min_pu": seen.v_min_pu, "ac_v_error_pu": seen.v_error_pu,
-            "ac_status": seen.status}
+    return {
+        "ac_passed": int(seen.passed),
+        "ac_v_min_pu": seen.v_min_pu,
+        "ac_v_error_pu": seen.v_error_pu,
+        "ac_status": seen.status,
+    }
 
 
 def _hosting(name: str, role: str, subset: str, by_site: Mapping[int, float]) -> dict[str, Any]:
-    return {"name": name, "role": role, "subset": subset, "total_mw": float(sum(by_site.values())),
-            "by_site": {str(bus): float(mw) for bus, mw in by_site.items()}}
+    return {
+        "name": name,
+        "role": role,
+        "subset": subset,
+        "total_mw": float(sum(by_site.values())),
+        "by_site": {str(bus): float(mw) for bus, mw in by_site.items()},
+    }

@@ -44,8 +44,14 @@ class Reporter(Silent):
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-            self._bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                                 TextColumn("{task.fields[note]}"), TimeElapsedColumn(), console=Console(file=self.stream))
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[note]}"),
+                TimeElapsedColumn(),
+                console=Console(file=self.stream),
+            )
             self._bar.start()
         return self
 
@@ -65,14 +71,18 @@ class Reporter(Silent):
         """Tasks that have ended, all tasks, tasks without a result."""
         now = time.monotonic()
         begin, before = self._begin.setdefault(phase, (now, ended))
-        note = remaining(now - begin, ended - before, total - ended) + (f", {lost} without result" if lost else "")
+        note = remaining(now - begin, ended - before, total - ended) + (
+            f", {lost} without result" if lost else ""
+        )
         if self._bar is not None:
             if phase not in self._rows:
                 self._rows[phase] = self._bar.add_task(phase, total=total, note="")
             self._bar.update(self._rows[phase], completed=ended, total=total, note=note)
         elif ended == total or now - self._said >= self.every_s:
             self._said = now
-            print(f"{phase}: {ended} of {total} done{', ' + note if note else ''}", file=self.stream, flush=True)
+            print(
+                f"{phase}: {ended} of {total} done{', ' + note if note else ''}", file=self.stream, flush=True
+            )
 
 
 def remaining(elapsed: float, done: int, left: int) -> str:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from dcvrt.waveform import Waveform
 
 
-def ride(variant: str, waveform: str, beta: float, out: Path | None, named: Sequence[str]) -> tuple[str, bool]:
+def ride(
+    variant: str, waveform: str, beta: float, out: Path | None, named: Sequence[str]
+) -> tuple[str, bool]:
     """Run a variant on a waveform.
 
     Parameters
@@ -38,10 +40,16 @@ def ride(variant: str, waveform: str, beta: float, out: Path | None, named: Sequ
 
     simulator = Simulator(facility.get(variant).compile(), save_at=1e-3)
     run = simulator.attempt(waveform_of(waveform, named), H=1.0, beta=beta)
-    lines = [f"{variant} on {run.name}, beta {beta:g}, on the base of its own capacity", f"status: {run.status}"]
+    lines = [
+        f"{variant} on {run.name}, beta {beta:g}, on the base of its own capacity",
+        f"status: {run.status}",
+    ]
     if run.completed:
         found = margins(run, Criteria())
-        lines += [f"voltage margin: {found.voltage.value:+.4f} pu", f"loss margin:    {found.loss.value:+.4f} of the import"]
+        lines += [
+            f"voltage margin: {found.voltage.value:+.4f} pu",
+            f"loss margin:    {found.loss.value:+.4f} of the import",
+        ]
         lines += [f"  {name}: {value:.6g}" for name, value in found.diagnostics.items()]
     lines += ["events:"] + [f"  {event}" for event in run.events] if run.events else ["events: none"]
     if out is not None:
@@ -69,7 +77,9 @@ def waveform_of(name: str, named: Sequence[str]) -> Waveform:
         return Waveform.sag(retained=int(sag[1]) / 100, start=0.1, length=0.15, until=3.0)
     path = Path(name)
     if not path.is_file():
-        raise InputError(f"waveform {name!r}: no such file and no such test waveform.{did_you_mean(name, named)}")
+        raise InputError(
+            f"waveform {name!r}: no such file and no such test waveform.{did_you_mean(name, named)}"
+        )
     return Waveform.from_csv(path)
 
 

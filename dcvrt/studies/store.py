@@ -1,33 +1,41 @@
 """The store of a study: one SQLite file that says what was asked, what was done and what came out.
 
-Written by one process only, in transactions of one finished task; WAL and `synchronous = NORMAL`, so that a killed
-run leaves whole tasks behind. Readers may look in at any time.
+Written by one process only, in transactions of one finished task; WAL and `synchronous = NORMAL`, so that a
+killed run leaves whole tasks behind. Readers may look in at any time.
 
-Tables (the read methods of :class:`Store` return them as DataFrames, in an order that does not depend on the order
-in which the work was done):
+Tables (the read methods of :class:`Store` return them as DataFrames, in an order that does not depend on the
+order in which the work was done):
 
 `provenance`   key, value (JSON): study text and hash, versions, platform, compiler, seeds, network, sources.
-`tasks`        hash, phase, text, status (open, done, failed, timeout, quarantined), attempts, message, seconds.
-`hostings`     name, role ('sample' or 'plan'), subset ('fit', 'validation' or ''), total_mw, by_site {bus: MW}.
-`margins`      one checked facility run: hosting, period, fault, site, mode, beta; h_mw, p_mw (import before the
-               fault); v_margin_pu, loss_margin_share, loss_margin_mw, loss_share, loss_mw; v_poi_min_pu (lowest
-               retained voltage); status (a sentence), ok (1 when the run has margins), sequence (modes passed
-               through), battery (1 when the supervisor visited BATTERY), diagnostics (JSON).
-               Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in says
-               what failed: 'grid' (no waveform), 'facility' or 'task' (set aside before it ended).
-`waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave, else those
-               of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The first
-               signal is always t_s.
-`surrogates`   one fitted margin: method, mode, site, fault, target ('voltage' or 'loss'), period ('' where pooled),
-               beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening; unknown ([beta, period] at which no run
-               has a margin: the site counts as not passing there); n_fit, n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is not the most
-               common one), n_sequences; mae, rmse, worst_over, worst_under, violation_rate, on the validation set.
-`predictions`  validation points of every surrogate, numbered: method, mode, site, fault, target, period, beta,
+`tasks`        hash, phase, text, status (open, done, failed, timeout, quarantined), attempts, message,
+seconds. `hostings`     name, role ('sample' or 'plan'), subset ('fit', 'validation' or ''), total_mw, by_site
+{bus: MW}. `margins`      one checked facility run: hosting, period, fault, site, mode, beta; h_mw, p_mw
+(import before the
+               fault); v_margin_pu, loss_margin_share, loss_margin_mw, loss_share, loss_mw; v_poi_min_pu
+               (lowest retained voltage); status (a sentence), ok (1 when the run has margins), sequence
+               (modes passed through), battery (1 when the supervisor visited BATTERY), diagnostics (JSON).
+               Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in
+               says what failed: 'grid' (no waveform), 'facility' or 'task' (set aside before it ended).
+`waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave,
+else those
+               of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The
+               first signal is always t_s.
+`surrogates`   one fitted margin: method, mode, site, fault, target ('voltage' or 'loss'), period ('' where
+pooled),
+               beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening;
+               unknown ([beta, period] at which no run has a margin: the site counts as not passing there);
+               n_fit, n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is
+               not the most common one), n_sequences; mae, rmse, worst_over, worst_under, violation_rate, on
+               the validation set.
+`predictions`  validation points of every surrogate, numbered: method, mode, site, fault, target, period,
+beta,
                hosting, point, margin, predicted.
-`plans`        method ('none' is the plan without ride-through), mode, beta, hosting, total_mw, by_site, binding and
-               closed (JSON), carried_from (the smaller beta it was found at, or empty), ac_passed, ac_v_min_pu,
-               ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed, worst_voltage_margin_pu,
-               worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss, aggregate: where}, n_failed.
+`plans`        method ('none' is the plan without ride-through), mode, beta, hosting, total_mw, by_site,
+binding and
+               closed (JSON), carried_from (the smaller beta it was found at, or empty), ac_passed,
+               ac_v_min_pu, ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed,
+               worst_voltage_margin_pu, worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss,
+               aggregate: where}, n_failed.
 """
 
 from __future__ import annotations
@@ -53,32 +61,39 @@ VERSION = 1
 
 TABLES = {
     "provenance": "key TEXT PRIMARY KEY, value TEXT NOT NULL",
-    "tasks": "hash TEXT PRIMARY KEY, phase TEXT NOT NULL, text TEXT NOT NULL, status TEXT NOT NULL DEFAULT 'open', "
-             "attempts INTEGER NOT NULL DEFAULT 0, message TEXT NOT NULL DEFAULT '', seconds REAL",
+    "tasks": "hash TEXT PRIMARY KEY, phase TEXT NOT NULL, text TEXT NOT NULL, status TEXT NOT NULL DEFAULT "
+    "'open', "
+    "attempts INTEGER NOT NULL DEFAULT 0, message TEXT NOT NULL DEFAULT '', seconds REAL",
     "hostings": "name TEXT PRIMARY KEY, role TEXT NOT NULL, subset TEXT NOT NULL, total_mw REAL NOT NULL, "
-                "by_site TEXT NOT NULL",
+    "by_site TEXT NOT NULL",
     "margins": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
-               "mode TEXT NOT NULL, beta REAL NOT NULL, h_mw REAL, p_mw REAL, v_margin_pu REAL, loss_margin_share REAL, "
-               "loss_margin_mw REAL, loss_share REAL, loss_mw REAL, v_poi_min_pu REAL, status TEXT NOT NULL, "
-               "ok INTEGER NOT NULL, failed_in TEXT NOT NULL, sequence TEXT NOT NULL, battery INTEGER NOT NULL, diagnostics TEXT NOT NULL, "
-               "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
+    "mode TEXT NOT NULL, beta REAL NOT NULL, h_mw REAL, p_mw REAL, v_margin_pu REAL, loss_margin_share REAL, "
+    "loss_margin_mw REAL, loss_share REAL, loss_mw REAL, v_poi_min_pu REAL, status TEXT NOT NULL, "
+    "ok INTEGER NOT NULL, failed_in TEXT NOT NULL, sequence TEXT NOT NULL, battery INTEGER NOT NULL, "
+    "diagnostics TEXT NOT NULL, "
+    "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "waveforms": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
-                 "mode TEXT NOT NULL, beta REAL NOT NULL, signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT NULL, "
-                 "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
+    "mode TEXT NOT NULL, beta REAL NOT NULL, signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT "
+    "NULL, "
+    "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "surrogates": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
-                  "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, intercept REAL, slopes TEXT NOT NULL, "
-                  "rating_slope REAL, tightening REAL, unknown TEXT NOT NULL, n_fit INTEGER, n_validation INTEGER, n_excluded INTEGER, "
-                  "n_mixed INTEGER, n_sequences INTEGER, mae REAL, rmse REAL, worst_over REAL, worst_under REAL, "
-                  "violation_rate REAL, PRIMARY KEY (method, mode, site, fault, target, period, beta)",
+    "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, intercept REAL, slopes TEXT NOT NULL, "
+    "rating_slope REAL, tightening REAL, unknown TEXT NOT NULL, n_fit INTEGER, n_validation INTEGER, "
+    "n_excluded INTEGER, "
+    "n_mixed INTEGER, n_sequences INTEGER, mae REAL, rmse REAL, worst_over REAL, worst_under REAL, "
+    "violation_rate REAL, PRIMARY KEY (method, mode, site, fault, target, period, beta)",
     "predictions": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
-                   "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, "
-                   "point INTEGER NOT NULL, margin REAL NOT NULL, predicted REAL NOT NULL, "
-                   "PRIMARY KEY (method, mode, site, fault, target, period, beta, point)",
-    "plans": "method TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
-             "by_site TEXT NOT NULL, binding TEXT NOT NULL, closed TEXT NOT NULL, carried_from REAL, ac_passed INTEGER, "
-             "ac_v_min_pu REAL, ac_v_error_pu REAL, ac_status TEXT, replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
-             "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
-             "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
+    "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, "
+    "point INTEGER NOT NULL, margin REAL NOT NULL, predicted REAL NOT NULL, "
+    "PRIMARY KEY (method, mode, site, fault, target, period, beta, point)",
+    "plans": "method TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw "
+    "REAL NOT NULL, "
+    "by_site TEXT NOT NULL, binding TEXT NOT NULL, closed TEXT NOT NULL, carried_from REAL, ac_passed "
+    "INTEGER, "
+    "ac_v_min_pu REAL, ac_v_error_pu REAL, ac_status TEXT, replayed INTEGER NOT NULL DEFAULT 0, passed "
+    "INTEGER, "
+    "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
+    "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
 }
 JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "unknown", "diagnostics", "worst"}
 
@@ -100,7 +115,9 @@ class Store:
     def __init__(self, path: str | Path, write: bool = False) -> None:
         self.path = Path(path)
         if not write and not self.path.is_file():
-            raise InputError(f"{self.path}: no study store. Way out: name a folder that 'dcvrt study run' has made.")
+            raise InputError(
+                f"{self.path}: no study store. Way out: name a folder that 'dcvrt study run' has made."
+            )
         self._guard = _only_writer(self.path) if write else None
         self._base = sqlite3.connect(self.path, isolation_level=None, timeout=30.0)
         if write:
@@ -110,7 +127,9 @@ class Store:
             version = self._base.execute("PRAGMA user_version").fetchone()[0]
         except sqlite3.DatabaseError as error:
             self.close()
-            raise InputError(f"{self.path}: not a study store ({error}). Way out: run into a new folder.") from None
+            raise InputError(
+                f"{self.path}: not a study store ({error}). Way out: run into a new folder."
+            ) from None
         if write and version == 0:
             with self.transaction():
                 for name, columns in TABLES.items():
@@ -118,8 +137,10 @@ class Store:
                 self._base.execute(f"PRAGMA user_version = {VERSION}")
         elif version != VERSION:
             self.close()
-            raise InputError(f"{self.path}: store version {version}, this dcvrt reads version {VERSION}. "
-                             "Way out: run the study again into a new folder.")
+            raise InputError(
+                f"{self.path}: store version {version}, this dcvrt reads version {VERSION}. "
+                "Way out: run the study again into a new folder."
+            )
 
     def close(self) -> None:
         """Close the file and let other writers in."""
@@ -152,8 +173,10 @@ class Store:
         for row in rows:
             plain = {key: json.dumps(value) if key in JSON_COLUMNS else value for key, value in row.items()}
             marks = ", ".join("?" * len(plain))
-            self._base.execute(f"INSERT OR REPLACE INTO {table} ({', '.join(plain)}) VALUES ({marks})",
-                               [_plain(value) for value in plain.values()])
+            self._base.execute(
+                f"INSERT OR REPLACE INTO {table} ({', '.join(plain)}) VALUES ({marks})",
+                [_plain(value) for value in plain.values()],
+            )
 
     def clear(self, *tables: str) -> None:
         """Empty tables that are derived from others and are about to be derived again."""
@@ -162,14 +185,37 @@ class Store:
 
     def note(self, **values: Any) -> None:
         """Record facts about the run in `provenance`."""
-        self._base.executemany("INSERT OR REPLACE INTO provenance VALUES (?, ?)",
-                               [(key, json.dumps(value)) for key, value in values.items()])
+        self._base.executemany(
+            "INSERT OR REPLACE INTO provenance VALUES (?, ?)",
+            [(key, json.dumps(value)) for key, value in values.items()],
+        )
 
-    def put_waveform(self, signals: Mapping[str, npt.ArrayLike], *, hosting: str, period: str, fault: str, site: int,
-                     mode: str = "", beta: float = 0.0) -> None:
+    def put_waveform(
+        self,
+        signals: Mapping[str, npt.ArrayLike],
+        *,
+        hosting: str,
+        period: str,
+        fault: str,
+        site: int,
+        mode: str = "",
+        beta: float = 0.0,
+    ) -> None:
         """Write signals over one time axis, `t_s` first."""
-        self.put("waveforms", [dict(hosting=hosting, period=period, fault=fault, site=site, mode=mode, beta=beta,
-                                    **pack(signals))])
+        self.put(
+            "waveforms",
+            [
+                dict(
+                    hosting=hosting,
+                    period=period,
+                    fault=fault,
+                    site=site,
+                    mode=mode,
+                    beta=beta,
+                    **pack(signals),
+                )
+            ],
+        )
 
     # -- tasks ---------------------------------------------------------------------------------------------
 
@@ -180,13 +226,17 @@ class Store:
 
     def task_states(self, phase: str | None = None) -> dict[str, tuple[str, int]]:
         """Status and attempts of each task, by hash."""
-        rows = self._base.execute("SELECT hash, status, attempts FROM tasks WHERE ?1 IS NULL OR phase = ?1", (phase,))
+        rows = self._base.execute(
+            "SELECT hash, status, attempts FROM tasks WHERE ?1 IS NULL OR phase = ?1", (phase,)
+        )
         return {key: (status, attempts) for key, status, attempts in rows}
 
     def set_task(self, key: str, status: str, message: str = "", seconds: float | None = None) -> None:
         """Write how a task ended."""
-        self._base.execute("UPDATE tasks SET status = ?, message = ?, seconds = ? WHERE hash = ?",
-                           (status, message, seconds, key))
+        self._base.execute(
+            "UPDATE tasks SET status = ?, message = ?, seconds = ? WHERE hash = ?",
+            (status, message, seconds, key),
+        )
 
     def count_attempt(self, key: str, by: int = 1) -> None:
         """Count a start of a task before it starts, so that a death of this very process counts too."""
@@ -196,7 +246,9 @@ class Store:
         """Make tasks of these statuses open again; how many."""
         marks = ", ".join("?" * len(statuses))
         return self._base.execute(
-            f"UPDATE tasks SET status = 'open', attempts = 0, message = '' WHERE status IN ({marks})", statuses).rowcount
+            f"UPDATE tasks SET status = 'open', attempts = 0, message = '' WHERE status IN ({marks})",
+            statuses,
+        ).rowcount
 
     # -- reading -------------------------------------------------------------------------------------------
 
@@ -211,8 +263,12 @@ class Store:
     def margins(self, role: str | None = None) -> pd.DataFrame:
         """Every checked facility run; `role` 'sample' or 'plan' takes those of such hosting vectors only."""
         where = "" if role is None else "WHERE hosting IN (SELECT name FROM hostings WHERE role = ?)"
-        return self._frame("margins", where, () if role is None else (role,),
-                           order="hosting, period, fault, site, mode, beta")
+        return self._frame(
+            "margins",
+            where,
+            () if role is None else (role,),
+            order="hosting, period, fault, site, mode, beta",
+        )
 
     def surrogates(self) -> pd.DataFrame:
         """Every fitted margin with its validation figures."""
@@ -237,25 +293,39 @@ class Store:
         condition = " AND ".join(f"{column} = ?" for column in where) or "1"
         rows = self._base.execute(
             "SELECT hosting, period, fault, site, mode, beta, signals, n, packed FROM waveforms "
-            f"WHERE {condition} ORDER BY hosting, period, fault, site, mode, beta", list(where.values()))
+            f"WHERE {condition} ORDER BY hosting, period, fault, site, mode, beta",
+            list(where.values()),
+        )
         keys = ("hosting", "period", "fault", "site", "mode", "beta")
         return [(dict(zip(keys, row[:6], strict=True)), unpack(row[6], row[7], row[8])) for row in rows]
 
     def provenance(self) -> dict[str, Any]:
         """What the study is and what it was made with."""
-        return {key: json.loads(value) for key, value in self._base.execute("SELECT key, value FROM provenance ORDER BY key")}
+        return {
+            key: json.loads(value)
+            for key, value in self._base.execute("SELECT key, value FROM provenance ORDER BY key")
+        }
 
     def integrity(self) -> str:
         """'ok', or what SQLite finds wrong with the file."""
         return str(self._base.execute("PRAGMA integrity_check").fetchone()[0])
 
-    def _frame(self, table: str, where: str = "", values: Sequence[Any] = (), order: str = "1") -> pd.DataFrame:
+    def _frame(
+        self, table: str, where: str = "", values: Sequence[Any] = (), order: str = "1"
+    ) -> pd.DataFrame:
         import pandas as pd
 
-        frame = pd.read_sql_query(f"SELECT * FROM {table} {where} ORDER BY {order}", self._base, params=list(values))
+        frame = pd.read_sql_query(
+            f"SELECT * FROM {table} {where} ORDER BY {order}", self._base, params=list(values)
+        )
         for column in JSON_COLUMNS & set(frame.columns):
             frame[column] = [json.loads(text) for text in frame[column]]
         return frame
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows of a table as plain mappings."""
+    return [{str(key): value for key, value in row.items()} for row in frame.to_dict("records")]
 
 
 def pack(signals: Mapping[str, npt.ArrayLike]) -> dict[str, Any]:
@@ -267,13 +337,23 @@ def pack(signals: Mapping[str, npt.ArrayLike]) -> dict[str, Any]:
     """
     table = np.stack([np.asarray(values, dtype="<f4") for values in signals.values()])
     shuffled = np.frombuffer(table.tobytes(), np.uint8).reshape(-1, 4).T.tobytes()
-    return {"signals": json.dumps(list(signals)), "n": int(table.shape[1]), "packed": zlib.compress(shuffled, 1)}
+    return {
+        "signals": json.dumps(list(signals)),
+        "n": int(table.shape[1]),
+        "packed": zlib.compress(shuffled, 1),
+    }
 
 
 def unpack(signals: str, n: int, packed: bytes) -> dict[str, npt.NDArray[np.float32]]:
     """Undo `pack`."""
     names = json.loads(signals)
-    values = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(4, -1).T.copy().view("<f4").reshape(len(names), n)
+    values = (
+        np.frombuffer(zlib.decompress(packed), np.uint8)
+        .reshape(4, -1)
+        .T.copy()
+        .view("<f4")
+        .reshape(len(names), n)
+    )
     return dict(zip(names, values, strict=True))
 
 
@@ -291,6 +371,8 @@ def _only_writer(path: Path) -> sqlite3.Connection:
         lock.execute("BEGIN EXCLUSIVE")
     except sqlite3.OperationalError:
         lock.close()
-        raise InputError(f"{path.parent}: another run is writing into this folder. "
-                         "Way out: wait for it to end, or choose another folder with --out.") from None
+        raise InputError(
+            f"{path.parent}: another run is writing into this folder. "
+            "Way out: wait for it to end, or choose another folder with --out."
+        ) from None
     return lock

@@ -16,7 +16,7 @@ from dcvrt.studies import checks, config, outputs, phases
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
-from dcvrt.studies.store import Store
+from dcvrt.studies.store import Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,14 +53,25 @@ class Study:
             With every mistake in the file.
         """
         if path is None:
-            return cls(checks.check(config.template(), "the IEEE-118 study", Path.cwd()), config.template(), Path.cwd(),
-                       "ieee118")
+            return cls(
+                checks.check(config.template(), "the IEEE-118 study", Path.cwd()),
+                config.template(),
+                Path.cwd(),
+                "ieee118",
+            )
         path = Path(path)
         text = config.read_text(path)
         return cls(checks.check(text, str(path), path.parent), text, path.resolve().parent, path.stem)
 
-    def run(self, out: str | Path | None = None, workers: int = 1, scheduler: str | None = None, quick: bool = False,
-            retry: bool = False, reporter: Silent | None = None) -> Result:
+    def run(
+        self,
+        out: str | Path | None = None,
+        workers: int = 1,
+        scheduler: str | None = None,
+        quick: bool = False,
+        retry: bool = False,
+        reporter: Silent | None = None,
+    ) -> Result:
         """Do what the folder does not have yet, and write the results.
 
         Parameters
@@ -128,14 +139,25 @@ class Study:
             raise InputError("; ".join(problems))
         h = file.hosting
         year = checks.profiles_of(h, self.folder)
-        problem = HostingProblem(network, tuple(file.grid.sites), year, rating_scale=h.rating_scale,
-                                 voltage=(h.v_min_pu, h.v_max_pu), pf=h.pf)
+        problem = HostingProblem(
+            network,
+            tuple(file.grid.sites),
+            year,
+            rating_scale=h.rating_scale,
+            voltage=(h.v_min_pu, h.v_max_pu),
+            pf=h.pf,
+        )
         chosen = year.representative(network)
         periods = {}
         for entry in file.period:
             hour = year.at(chosen[entry.hour] if isinstance(entry.hour, str) else entry.hour)
-            periods[entry.name] = {"name": entry.name, "hour": hour.hour, "load_scale": hour.load, "dc_factor": hour.dc,
-                                   "wind": {str(bus): mw for bus, mw in hour.wind.items()}}
+            periods[entry.name] = {
+                "name": entry.name,
+                "hour": hour.hour,
+                "load_scale": hour.load,
+                "dc_factor": hour.dc,
+                "wind": {str(bus): mw for bus, mw in hour.wind.items()},
+            }
         return phases.Setting(file, self.folder, problem, periods, problem.solve())
 
     def _note(self, store: Store, file: StudyFile, setting: phases.Setting, quick: bool) -> None:
@@ -144,16 +166,38 @@ class Study:
 
         with store.transaction():
             store.note(
-                study=file.canonical(), study_name=file.study.name, study_text=self.text, quick=quick,
-                versions=versions(), platform=platform.platform(), engine=file.grid.engine, seed=file.study.seed,
-                periods=setting.periods, criteria=phases.criteria(file), sites=list(setting.sites),
-                sources=dict(setting.problem.year.sources), network=setting.problem.network.name,
+                study=file.canonical(),
+                study_name=file.study.name,
+                study_text=self.text,
+                quick=quick,
+                versions=versions(),
+                platform=platform.platform(),
+                engine=file.grid.engine,
+                seed=file.study.seed,
+                periods=setting.periods,
+                criteria=phases.criteria(file),
+                sites=list(setting.sites),
+                sources=dict(setting.problem.year.sources),
+                network=setting.problem.network.name,
                 faults=[fault.model_dump() for fault in file.fault],
-                facilities={mode: [{"path": row.path, "value": row.value, "unit": row.unit, "doc": row.doc,
-                                    "source": row.source} for row in facility.get(mode).compile().parameters]
-                            for mode in file.facility.modes},
-                parameters={mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
-                            for mode in file.facility.modes})
+                facilities={
+                    mode: [
+                        {
+                            "path": row.path,
+                            "value": row.value,
+                            "unit": row.unit,
+                            "doc": row.doc,
+                            "source": row.source,
+                        }
+                        for row in facility.get(mode).compile().parameters
+                    ]
+                    for mode in file.facility.modes
+                },
+                parameters={
+                    mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
+                    for mode in file.facility.modes
+                },
+            )
 
 
 @dataclass(frozen=True)
@@ -180,12 +224,16 @@ class Result:
         """
         folder = Path(folder)
         with Store(folder / outputs.STORE) as store:
-            unfinished = store.plans().empty or not store.plans().query("method != 'none'").replayed.all()
-            tasks = store.tasks()
+            plans, tasks = records(store.plans()), records(store.tasks())
+        unfinished = not plans or any(not p["replayed"] for p in plans if p["method"] != phases.NO_VRT)
         if unfinished:
-            raise InputError(f"{folder}: the study is not finished. Way out: the same 'dcvrt study run' resumes it.")
-        away = tasks[tasks.status.isin(LOST)]
-        return cls(folder, [f"{t.phase} task {t.hash[:12]}: {t.status}: {t.message}" for t in away.itertuples()])
+            raise InputError(
+                f"{folder}: the study is not finished. Way out: the same 'dcvrt study run' resumes it."
+            )
+        away = [task for task in tasks if task["status"] in LOST]
+        return cls(
+            folder, [f"{t['phase']} task {t['hash'][:12]}: {t['status']}: {t['message']}" for t in away]
+        )
 
     @property
     def complete(self) -> bool:
@@ -210,7 +258,7 @@ class Result:
 
         with Store(self.folder / outputs.STORE) as store:
             files = outputs.write_results(self.folder, store)
-        return [*files, *draw_all(self.folder), *write_report(self.folder)]
+        return [*files, *draw_all(self.folder), write_report(self.folder)]
 
 
 def versions() -> dict[str, str]:
@@ -234,9 +282,14 @@ def prepare(file: StudyFile, setting: phases.Setting) -> dict[str, str]:
     """
     from dcvrt.planning import replay
 
-    return {mode: replay.prepare(setting.request([0.0] * len(setting.sites), next(iter(setting.periods)), [(mode, 1.0)],
-                                                 keep=False))
-            for mode in file.facility.modes}
+    return {
+        mode: replay.prepare(
+            setting.request(
+                [0.0] * len(setting.sites), next(iter(setting.periods)), [(mode, 1.0)], keep=False
+            )
+        )
+        for mode in file.facility.modes
+    }
 
 
 def refuse_another_study(store: Store, file: StudyFile, folder: Path) -> None:
@@ -251,15 +304,23 @@ def refuse_another_study(store: Store, file: StudyFile, folder: Path) -> None:
     if "study" not in known:
         return
     before, now = flat(known["study"]), flat(file.canonical())
-    changed = [f"{key}: was {before.get(key, 'not there')}, is {now.get(key, 'not there')}"
-               for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
+    changed = [
+        f"{key}: was {before.get(key, 'not there')}, is {now.get(key, 'not there')}"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key)
+    ]
     way_out = "Way out: take another folder with --out, or undo the change"
     if changed:
-        shown = "\n".join(f"  {line}" for line in changed[:8]) + (f"\n  ... {len(changed) - 8} more" if len(changed) > 8 else "")
+        shown = "\n".join(f"  {line}" for line in changed[:8]) + (
+            f"\n  ... {len(changed) - 8} more" if len(changed) > 8 else ""
+        )
         raise InputError(f"{folder} holds the results of another study:\n{shown}\n{way_out}.")
     here = versions()
-    other = [f"  {name}: was {known['versions'].get(name)}, is {here[name]}" for name in DECIDING
-             if known["versions"].get(name) != here[name]]
+    other = [
+        f"  {name}: was {known['versions'].get(name)}, is {here[name]}"
+        for name in DECIDING
+        if known["versions"].get(name) != here[name]
+    ]
     if other:
         raise InputError(f"{folder} was made with other versions:\n" + "\n".join(other) + f"\n{way_out}.")
 
@@ -271,7 +332,11 @@ def flat(data: Any, path: str = "") -> dict[str, str]:
     {'grid.sites': '[1, 2]', 'fault[1].bus': '3'}
     """
     if isinstance(data, dict) and data:
-        return {k: v for key, item in data.items() for k, v in flat(item, f"{path}.{key}" if path else str(key)).items()}
+        return {
+            k: v
+            for key, item in data.items()
+            for k, v in flat(item, f"{path}.{key}" if path else str(key)).items()
+        }
     if isinstance(data, list) and data and isinstance(data[0], dict):
         return {k: v for n, item in enumerate(data, 1) for k, v in flat(item, f"{path}[{n}]").items()}
     return {path: json.dumps(data)}

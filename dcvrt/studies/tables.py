@@ -31,10 +31,16 @@ def read_profiles(path: Path) -> Year:
     header = [name.strip() for name in rows[0]]
     needed = ["hour", "load", "dc"]
     problems = [f"no column {name!r}. It has: {', '.join(header)}." for name in needed if name not in header]
-    problems += [f"column {name!r} is none of hour, load, dc, wind_<bus>_mw." for name in header
-                 if name not in needed and not WIND.fullmatch(name)]
-    problems += [f"line {k} has {len(row)} cells, the header has {len(header)}."
-                 for k, row in enumerate(rows[1:], start=2) if len(row) != len(header)][:3]
+    problems += [
+        f"column {name!r} is none of hour, load, dc, wind_<bus>_mw."
+        for name in header
+        if name not in needed and not WIND.fullmatch(name)
+    ]
+    problems += [
+        f"line {k} has {len(row)} cells, the header has {len(header)}."
+        for k, row in enumerate(rows[1:], start=2)
+        if len(row) != len(header)
+    ][:3]
     raise_all(problems, path.name)
     columns = {}
     for c, name in enumerate(header):
@@ -46,5 +52,10 @@ def read_profiles(path: Path) -> Year:
     if (columns["hour"] != np.round(columns["hour"])).any():
         raise InputError(f"{path.name}: column 'hour' must hold whole numbers.")
     wind = {int(found[1]): columns[name] for name in header if (found := WIND.fullmatch(name))}
-    return Year(hours=columns["hour"].astype(np.int64), load=columns["load"], dc=columns["dc"], wind=wind,
-                sources=dict.fromkeys(("load", "dc", "wind"), path.name))
+    return Year(
+        hours=columns["hour"].astype(np.int64),
+        load=columns["load"],
+        dc=columns["dc"],
+        wind=wind,
+        sources=dict.fromkeys(("load", "dc", "wind"), path.name),
+    )

@@ -19,7 +19,8 @@ from dcvrt.grid.redispatch import share
     [
         (
             {"clear": -0.1},
-            "fault at bus 23: clear = -0.1 s: the fault would be cleared before it starts. `clear` is the time from "
+            "fault at bus 23: clear = -0.1 s: the fault would be cleared before it starts. `clear` is the "
+            "time from "
             "inception to clearing and must be positive.",
         ),
         (
@@ -29,12 +30,14 @@ from dcvrt.grid.redispatch import share
         ({"x_f": -1.0}, "fault at bus 23: x_f = -1, r_f = 0 pu: neither may be negative."),
         (
             {"x_f": 0.0},
-            "fault at bus 23: x_f and r_f are both 0: the power balance at the bus has no solution in voltage magnitude "
+            "fault at bus 23: x_f and r_f are both 0: the power balance at the bus has no solution in "
+            "voltage magnitude "
             "and angle. Way out: x_f = 1e-4 pu is a bolted fault for every purpose.",
         ),
         (
             {"start": float("nan"), "clear": float("inf")},
-            "fault at bus 23: 2 problems\n  start = nan is not a finite number.\n  clear = inf is not a finite number.",
+            "fault at bus 23: 2 problems\n  start = nan is not a finite number.\n  clear = inf is not a "
+            "finite number.",
         ),
     ],
 )
@@ -61,7 +64,8 @@ def test_period_and_fault_travel_to_workers() -> None:
     assert hash(pickle.loads(pickle.dumps(period))) == hash(period)
 
 
-UNITS = st.lists(st.tuples(st.floats(-50, 500), st.floats(1.0, 2.0)), min_size=2, max_size=30).filter(
+MEGAWATT = st.one_of(st.just(0.0), st.floats(1.0, 500.0), st.floats(-50.0, -1.0))
+UNITS = st.lists(st.tuples(MEGAWATT, st.floats(1.0, 2.0)), min_size=2, max_size=30).filter(
     lambda units: sum(p for p, _ in units if p > 0) > 1
 )
 

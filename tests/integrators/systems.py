@@ -12,9 +12,11 @@ from dcvrt.waveform import Waveform
 
 
 class Sketch:
-    """Symbols of a system to be: states, algebraic variables, POI voltage, parameters, one automaton or more."""
+    """Symbols of a system to be: states, algebraic variables, POI voltage, parameters, automata."""
 
-    def __init__(self, states: Mapping[str, float], parameters: Mapping[str, float], algebraics: Sequence[str] = ()):
+    def __init__(
+        self, states: Mapping[str, float], parameters: Mapping[str, float], algebraics: Sequence[str] = ()
+    ):
         self.states, self.parameters, self.algebraics = dict(states), dict(parameters), list(algebraics)
         self.t = ca.SX.sym("t")
         self.x = {n: ca.SX.sym(n) for n in states}
@@ -31,7 +33,16 @@ class Sketch:
         q, clock = ca.SX.sym(f"{path}_q", width), ca.SX.sym(f"{path}_clock")
         rows: list[Transition] = []
         names = tuple(f"flag_{k}" for k in range(width))
-        self._pending = (path, tuple(flags), start, q, names, np.array(list(flags.values()), dtype=float), clock, rows)
+        self._pending = (
+            path,
+            tuple(flags),
+            start,
+            q,
+            names,
+            np.array(list(flags.values()), dtype=float),
+            clock,
+            rows,
+        )
         self.automata.append(self._pending)  # type: ignore[arg-type]
         return q, clock, rows
 
@@ -67,7 +78,8 @@ class Sketch:
             parameter_rows=tuple(Row(n, "1", v, (-10.0, 10.0)) for n, v in self.parameters.items()),
             outputs=tuple(Row(n, "1") for n in outputs),
             automata=tuple(
-                Automaton(*parts[:7], tuple(parts[7])) for parts in self.automata  # type: ignore[index]
+                Automaton(*parts[:7], tuple(parts[7]))
+                for parts in self.automata  # type: ignore[index]
             ),
             start=column(begin.values()),
         )
@@ -92,7 +104,7 @@ def ball() -> Dae:
 
 
 def store() -> Dae:
-    """Energy E drained by P below the voltage limit, refilled with rate R once it fell below E_min, until E_max."""
+    """Energy E drained by P from a dip on; refilled with rate R from E_min until E_max, and again."""
     s = Sketch({"E": 1.0}, {"P": 1.0, "R": 2.0, "E_min": 0.5, "E_max": 0.8})
     q, _, rows = s.automaton("sup", {"rest": (0.0, 0.0), "drain": (1.0, 0.0), "fill": (0.0, 1.0)}, "rest")
     rows += [

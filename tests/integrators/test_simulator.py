@@ -8,7 +8,6 @@ from math import exp, pi, sin
 import casadi as ca
 import numpy as np
 import pytest
-from pytest import approx
 
 from dcvrt import facility
 from dcvrt.dae import Dae, Row
@@ -20,7 +19,7 @@ from dcvrt.waveform import Waveform
 from tests.integrators.systems import Sketch, ball, decay, flat
 
 MODES = ("gfl", "gfm")
-# A shallow voltage limit, so that the DC energy and not the voltage calls for the battery: an event on a state.
+# A low voltage limit, so that the DC energy and not the voltage calls for the battery: an event on a state.
 ENERGY_FIRST = {"beta": 1.05, "sup.V_dip": 0.3, "sup.V_low": 0.25, "sup.V_deep": 0.2, "sup.V_back": 0.9}
 
 
@@ -37,7 +36,7 @@ def simulator(
 
 
 def oracle(mode: str) -> Simulator:
-    """For differences of runs: tight, and sampled so finely that interpolation between samples does not show."""
+    """For differences of runs: tight, and sampled so finely that interpolation does not show."""
     return simulator(mode, "erk", 1e-12, save_at=1e-4)
 
 
@@ -59,7 +58,9 @@ def three_disturbances() -> Waveform:
 
 
 def one_fault() -> Waveform:
-    return Waveform.segments([(0.0, 1.0), (0.1, 0.4 * np.exp(-0.3j)), (0.25, 0.97, 1.0), (0.6, 1.0)], until=0.7)
+    return Waveform.segments(
+        [(0.0, 1.0), (0.1, 0.4 * np.exp(-0.3j)), (0.25, 0.97, 1.0), (0.6, 1.0)], until=0.7
+    )
 
 
 def path_error(run: Trajectory, reference: Trajectory, names: tuple[str, ...]) -> float:
@@ -78,7 +79,7 @@ def test_undisturbed_run_stays_where_it_starts(mode: str) -> None:
 
 
 def test_open_directions_keep_their_start_value_and_its_derivative() -> None:
-    """A charge that nothing moves at rest: d(charge)/d(charge_0) = 1 although the equilibrium does not fix it."""
+    """A charge that nothing moves at rest: d(charge)/d(charge_0) = 1 though the equilibrium is silent."""
     s = Sketch({"a": 0.0, "charge": 0.0}, {"k": 2.0, "charge_0": 0.7})
     dae = s.dae(
         {"a": s.v[0] - s.p["k"] * s.x["a"], "charge": s.v[0] - s.p["k"] * s.x["a"]},
@@ -87,10 +88,10 @@ def test_open_directions_keep_their_start_value_and_its_derivative() -> None:
     )
     run = Simulator(dae, wrt=("k", "charge_0"))(flat())
     # the least-norm step shares the residual's direction among the states that it determines
-    assert run["a_out"][0] == approx(0.5, abs=1e-12)
-    assert run["charge_out"][0] == approx(0.7, abs=1e-12)
-    assert run.sens["charge_out", "charge_0"][-1] == approx(1.0, abs=1e-12)
-    assert run.sens["a_out", "k"][-1] == approx(-0.25, abs=1e-9)
+    assert run["a_out"][0] == pytest.approx(0.5, abs=1e-12)
+    assert run["charge_out"][0] == pytest.approx(0.7, abs=1e-12)
+    assert run.sens["charge_out", "charge_0"][-1] == pytest.approx(1.0, abs=1e-12)
+    assert run.sens["a_out", "k"][-1] == pytest.approx(-0.25, abs=1e-9)
 
 
 def test_no_equilibrium_names_the_largest_residuals() -> None:
@@ -112,8 +113,8 @@ def test_time_of_an_oscillator_and_its_sensitivity() -> None:
     om = s.p["omega"]
     dae = s.dae({"x": om * s.x["w"], "w": -om * s.x["x"]}, {"x_out": s.x["x"]})
     run = Simulator(dae, Casadi("erk", 1e-9, 1e-11), wrt=("omega",), start="given")(flat(3.0))
-    assert run["x_out"] == approx(np.cos(5 * run.t), abs=1e-6)
-    assert run.sens["x_out", "omega"] == approx(-run.t * np.sin(5 * run.t), abs=1e-5)
+    assert run["x_out"] == pytest.approx(np.cos(5 * run.t), abs=1e-6)
+    assert run.sens["x_out", "omega"] == pytest.approx(-run.t * np.sin(5 * run.t), abs=1e-5)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -136,10 +137,11 @@ def test_interpreted_equals_compiled(mode: str) -> None:
     assert path_error(run, other, ("v_it", "p_g", "w_dc")) < 1e-9
 
 
-def test_a_sampled_waveform_is_the_stepped_one() -> None:
+@pytest.mark.parametrize("plugin", ["erk", "rosenbrock", "cvodes"])
+def test_a_sampled_waveform_is_the_stepped_one(plugin: str) -> None:
     """Every 5 ms a sample, jumps marked: the same run, though every sample ends a cubic."""
     wave = one_fault()
-    simulate = simulator("gfl", "erk", 1e-8, save_at=2e-4)
+    simulate = simulator("gfl", plugin, 1e-8, save_at=2e-4)
     run, sampled = simulate(wave), simulate(wave.resampled(5e-3))
     assert [e.target for e in run.events] == [e.target for e in sampled.events]
     assert path_error(run, sampled, ("v_it", "p_g", "w_dc")) < 1e-6
@@ -149,7 +151,7 @@ def test_a_sampled_waveform_is_the_stepped_one() -> None:
 
 
 def relative_error(run: Trajectory, up: Trajectory, down: Trajectory, theta: str, step: float) -> float:
-    """Largest difference to central differences over the largest sensitivity, away from breaks, over signals."""
+    """Largest difference to central differences over the largest sensitivity, away from breaks."""
     times = np.linspace(run.t[0] + 1e-3, run.t[-1], 60)
     k = np.unique(np.searchsorted(run.t, times).clip(max=len(run.t) - 1))
     edges = [*run.t[run.breaks], *up.t[up.breaks], *down.t[down.breaks]]
@@ -195,7 +197,7 @@ def test_sensitivities_pass_timers_and_input_jumps(mode: str) -> None:
     assert {e.target for e in run.events} >= {"MIXED", "BATTERY", "RETURN"}
     for theta in thetas:
         value = run.parameters[theta]
-        step = 1e-5 * value
+        step = max(1e-5 * value, 2e-6)
         up, down = (oracle(mode)(wave, **{"beta": 1.15, theta: value + s * step}) for s in (1, -1))
         assert relative_error(run, up, down, theta, step) < 1e-4, theta
 
@@ -218,7 +220,7 @@ def test_tangents_of_the_waveform(mode: str) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rates_and_their_sensitivities_are_those_of_the_signals(mode: str) -> None:
-    """What the margins interpolate with: d/dt of a signal and of its sensitivity, against differences over 1e-5 s."""
+    """What the margins interpolate with: d/dt of signals and sensitivities, against differences."""
     wave = one_fault().resampled(0.02)
     wave = Waveform(wave.t, wave.v, {"H_75": 0.05 * (1 + wave.t**2) * (1 + 0.3j)})
     run = simulator(mode, "erk", 1e-11, ("H_75", "beta"), save_at=1e-5)(wave, beta=1.1)
@@ -240,7 +242,8 @@ def test_rates_and_their_sensitivities_are_those_of_the_signals(mode: str) -> No
             assert kinks.mean() < 0.01, name  # a difference across the end of a cubic piece is none
 
 
-# -- inputs ---------------------------------------------------------------------------------------------------
+# -- inputs
+# ---------------------------------------------------------------------------------------------------
 
 
 def lag() -> Dae:
@@ -250,7 +253,8 @@ def lag() -> Dae:
     none = ca.SX(0, 1)
     return Dae(
         "lag", t, x, none, ca.vertcat(v, u), a, a * (u - x), none, ca.vertcat(x, v[0]),
-        (Row("x", "1"),), (), (Row("v_poi.re", "pu(V)", 1.0), Row("v_poi.im", "pu(V)"), Row("g_it", "1", 1.0)),
+        (Row("x", "1"),), (),
+        (Row("v_poi.re", "pu(V)", 1.0), Row("v_poi.im", "pu(V)"), Row("g_it", "1", 1.0)),
         (Row("a", "1/s", 4.0, (0.0, 100.0)),), (Row("x_out", "1"), Row("v_out", "1")),
     )  # fmt: skip
 
@@ -261,14 +265,14 @@ def test_another_input_is_interpolated_and_jumps() -> None:
     run = Simulator(lag(), Casadi("erk", 1e-9, 1e-11))(
         Waveform.sag(0.5, 0.2, 0.1, until=1.0), inputs={"g_it": (t, [1.0, 1.0, 2.0, 2.0])}
     )
-    assert run["x_out"][-1] == approx(2.0 - exp(-a * 0.5), abs=1e-8)
-    assert sorted(run.t[run.breaks]) == approx([0.2, 0.3, 0.5])
+    assert run["x_out"][-1] == pytest.approx(2.0 - exp(-a * 0.5), abs=1e-8)
+    assert sorted(run.t[run.breaks]) == pytest.approx([0.2, 0.3, 0.5])
     fine = np.linspace(0.0, 1.0, 41)
     run = Simulator(lag(), Casadi("erk", 1e-9, 1e-11))(flat(), inputs={"g_it": (fine, np.cos(2 * pi * fine))})
     om = 2 * pi
     phase = (a * a * np.cos(om) + a * om * sin(om)) / (a * a + om * om)
     start = 1.0 - a * a / (a * a + om * om)
-    assert run["x_out"][-1] == approx(phase + start * exp(-a), abs=2e-5)
+    assert run["x_out"][-1] == pytest.approx(phase + start * exp(-a), abs=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -331,7 +335,8 @@ def test_unusable_solver_options() -> None:
     with pytest.raises(InputError) as error:
         Casadi("rosenbrok")  # type: ignore[arg-type]
     assert str(error.value) == (
-        "There is no CasADi integrator 'rosenbrok'. Did you mean 'rosenbrock'? Known: erk, rosenbrock, cvodes, idas."
+        "There is no CasADi integrator 'rosenbrok'. Did you mean 'rosenbrock'? "
+        "Known: erk, rosenbrock, cvodes, idas."
     )
     with pytest.raises(InputError) as error:
         Casadi(rtol=1e-17)
@@ -342,14 +347,17 @@ def test_algebraic_variables_need_a_solver_that_takes_them() -> None:
     with pytest.raises(ModelError) as error:
         Simulator(decay(), Casadi("erk"), start="given")(flat())
     assert str(error.value) == (
-        "sketch has 1 algebraic variable(s); plugin 'erk' takes none. Use Casadi(plugin='rosenbrock') or 'idas'."
+        "sketch has 1 algebraic variable(s); plugin 'erk' takes none. "
+        "Use Casadi(plugin='rosenbrock') or 'idas'."
     )
 
 
 def test_a_run_that_blows_up_says_when_where_and_in_which_mode() -> None:
     s = Sketch({"x": 1.0, "y": 0.0}, {"k": 1.0})
     dae = s.dae({"x": s.x["x"] ** 2, "y": -s.x["y"]}, {"x_out": s.x["x"]})
-    with pytest.raises(SimulationError, match=r"integration failed between .* s in mode no automaton: .*fastest state x = "):
+    with pytest.raises(
+        SimulationError, match=r"integration failed between .* s in mode no automaton: .*fastest state x = "
+    ):
         Simulator(dae, start="given")(flat(2.0))  # x = 1/(1 - t)
 
 

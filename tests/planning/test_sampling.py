@@ -14,16 +14,19 @@ UPPER = np.array([31.4, 153.9, 102.4, 104.1])
 def test_samples_lie_in_the_box_and_include_both_corners() -> None:
     samples = sample_hosting(UPPER, n=24, seed=7)
     assert samples.hosting.shape == (24, 4)
-    assert (samples.hosting >= 0).all() and (samples.hosting <= UPPER).all()
+    assert (samples.hosting >= 0).all()
+    assert (samples.hosting <= UPPER).all()
     np.testing.assert_array_equal(samples.hosting[0], UPPER)
     np.testing.assert_allclose(samples.hosting[1], NEAR_ZERO * UPPER, rtol=1e-6)
-    assert samples.fit[0] and samples.fit[1]
+    assert samples.fit[0]
+    assert samples.fit[1]
 
 
 def test_half_of_the_samples_lie_in_the_high_capacity_region() -> None:
     samples = sample_hosting(UPPER, n=34, seed=7, high_share=0.5, high_from=0.6)
     high = (samples.hosting[2:] >= 0.6 * UPPER).all(axis=1)
-    assert high[:16].all() and not high[16:].all()
+    assert high[:16].all()
+    assert not high[16:].all()
 
 
 def test_the_seed_decides_samples_and_split() -> None:
@@ -57,7 +60,8 @@ def test_bad_corners_are_named_at_once() -> None:
     assert str(caught.value) == (
         "sample_hosting: 2 problems\n"
         "  upper = [10.0, -5.0]: needs one capacity of 0 MW or more for each site.\n"
-        "  n = 2: needs at least 4 samples, two of them the corners of the box.")
+        "  n = 2: needs at least 4 samples, two of them the corners of the box."
+    )
 
 
 def test_nothing_to_sample_says_so() -> None:
@@ -65,4 +69,5 @@ def test_nothing_to_sample_says_so() -> None:
         sample_hosting([0.0, 0.0], n=8, seed=1)
     assert str(caught.value) == (
         "sample_hosting: upper is zero at every site: there is nothing to sample. "
-        "Way out: look at what binds the plan without ride-through, or give sampling.h_max_mw.")
+        "Way out: look at what binds the plan without ride-through, or give sampling.h_max_mw."
+    )

@@ -1,4 +1,5 @@
-"""Surrogates: exact on affine margins, never above a fitted point, conservative on kinked ones, honest about failures."""
+"""Surrogates: exact on affine margins, never above a fitted point, conservative on kinked ones, honest about
+failures."""
 
 from __future__ import annotations
 
@@ -24,8 +25,15 @@ PERIODS = {"peak": 1.0, "light": 0.8}
 LAMBDA = 0.10
 
 
-def runs(voltage, loss_share, betas=(1.0, 1.2, 1.4), n=40, seed=2, failed=lambda H, beta: False,
-         sequence=lambda H, beta: "NORMAL") -> MarginData:
+def runs(
+    voltage,
+    loss_share,
+    betas=(1.0, 1.2, 1.4),
+    n=40,
+    seed=2,
+    failed=lambda H, beta: False,
+    sequence=lambda H, beta: "NORMAL",
+) -> MarginData:
     """Margins given as functions of (H, d, beta, own site) on sampled hosting vectors."""
     samples = sample_hosting(UPPER, n=n, seed=seed)
     rows = []
@@ -35,14 +43,41 @@ def runs(voltage, loss_share, betas=(1.0, 1.2, 1.4), n=40, seed=2, failed=lambda
                 for beta in betas:
                     share = loss_share(H, d, beta, own)
                     ok = not failed(H, beta)
-                    rows.append((H, d, period, site, beta, voltage(H, d, beta, own) if ok else np.nan,
-                                 share if ok else np.nan, share * d * H[own] if ok else np.nan, ok,
-                                 sequence(H, beta), samples.fit[k], f"s{k:03}"))
+                    rows.append(
+                        (
+                            H,
+                            d,
+                            period,
+                            site,
+                            beta,
+                            voltage(H, d, beta, own) if ok else np.nan,
+                            share if ok else np.nan,
+                            share * d * H[own] if ok else np.nan,
+                            ok,
+                            sequence(H, beta),
+                            samples.fit[k],
+                            f"s{k:03}",
+                        )
+                    )
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     H, d, period, site, beta, v, share, mw, ok, order, fit, name = columns
-    return MarginData(sites=SITES, hosting=H, d=d, period=period, fault=np.full(len(d), "bus 32"),
-                      mode=np.full(len(d), "gfl"), site=site, beta=beta, voltage=v, loss_share=share, loss_mw=mw, ok=ok,
-                      sequence=order, fit=fit, name=name)
+    return MarginData(
+        sites=SITES,
+        hosting=H,
+        d=d,
+        period=period,
+        fault=np.full(len(d), "bus 32"),
+        mode=np.full(len(d), "gfl"),
+        site=site,
+        beta=beta,
+        voltage=v,
+        loss_share=share,
+        loss_mw=mw,
+        ok=ok,
+        sequence=order,
+        fit=fit,
+        name=name,
+    )
 
 
 def retained(H, d, own):
@@ -78,7 +113,9 @@ def test_paper_surrogate_recovers_an_affine_margin() -> None:
         assert f.intercept == pytest.approx(0.02, abs=1e-10)
         assert f.slopes == pytest.approx([-3e-4, 1e-4], abs=1e-12)
         assert f.rating_slope == pytest.approx(2e-3, abs=1e-12)
-        assert f.tightening < 1e-12 and f.scores.rmse < 1e-12 and f.scores.violation_rate == 0.0
+        assert f.tightening < 1e-12
+        assert f.scores.rmse < 1e-12
+        assert f.scores.violation_rate == 0.0
         coefficients, bound = f.at(beta=1.2, d=0.8, own=own)
         H = np.array([10.0, 60.0])
         assert coefficients @ H - bound == pytest.approx(affine(H, 0.8, 1.2, own), abs=1e-12)
@@ -91,13 +128,16 @@ def test_share_surrogate_recovers_a_margin_affine_at_each_rating_and_period() ->
     for f in fit_surrogates(runs(margin, margin), "share"):
         assert f.intercept == pytest.approx(f.beta**2 * (0.05 if f.period == "peak" else 0.08), abs=1e-10)
         assert f.slopes == pytest.approx([-2e-4 * f.beta, 1e-4], abs=1e-12)
-        assert f.rating_slope == 0.0 and f.tightening < 1e-12
+        assert f.rating_slope == 0.0
+        assert f.tightening < 1e-12
 
 
 @pytest.mark.parametrize("method", ["paper", "share"])
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), kink=st.floats(-0.05, 0.05), slope=st.floats(-1e-3, 1e-3))
-def test_tightening_never_overpredicts_a_fitted_point(method: str, seed: int, kink: float, slope: float) -> None:
+def test_tightening_never_overpredicts_a_fitted_point(
+    method: str, seed: int, kink: float, slope: float
+) -> None:
     rng = np.random.default_rng(seed)
 
     def rough(H, d, beta, own):
@@ -105,8 +145,12 @@ def test_tightening_never_overpredicts_a_fitted_point(method: str, seed: int, ki
 
     data = runs(rough, rough, n=20, seed=seed)
     for f in fit_surrogates(data, method):
-        chosen = ((data.site == f.site) & data.fit & ((data.period == f.period) | (f.period == ""))
-                  & ((data.beta == f.beta) | (f.beta == 0)))
+        chosen = (
+            (data.site == f.site)
+            & data.fit
+            & ((data.period == f.period) | (f.period == ""))
+            & ((data.beta == f.beta) | (f.beta == 0))
+        )
         guess = f.predict(data.hosting[chosen], data.d[chosen], data.beta[chosen], SITES.index(f.site))
         assert (guess <= data.margin(f.target, method)[chosen] + 1e-10).all()
         assert f.n_fit == chosen.sum()
@@ -122,7 +166,8 @@ def test_a_saturating_margin_gets_no_false_pass_where_it_was_sampled(method: str
 
 
 def test_share_surrogate_agrees_with_the_static_loss_law() -> None:
-    """loss <= lambda iff V >= (1 - lambda)/beta: at ratings that no kink disturbs, the fit's sign is the law's."""
+    """loss <= lambda iff V >= (1 - lambda)/beta: at ratings that no kink disturbs, the fit's sign is the
+    law's."""
     data = runs(lambda *a: 0.02, static_loss, betas=(1.1, 1.15, 1.2, 1.25, 1.3))
     rng = np.random.default_rng(9)
     seen = set()
@@ -143,7 +188,8 @@ def test_paper_rows_never_get_harder_as_the_rating_rises() -> None:
         assert f.rating_slope >= 0.0
         own = SITES.index(f.site)
         low, high = (f.at(beta, 1.0, own) for beta in (1.0, 1.5))
-        assert (high[0] >= low[0]).all() and high[1] == low[1]
+        assert (high[0] >= low[0]).all()
+        assert high[1] == low[1]
 
 
 def test_failed_runs_are_left_out_and_counted() -> None:
@@ -159,7 +205,11 @@ def test_failed_runs_are_left_out_and_counted() -> None:
 
 
 def test_mixed_event_sequences_are_counted() -> None:
-    data = runs(affine, static_loss, sequence=lambda H, beta: "NORMAL>BATTERY" if beta < 1.1 and H[0] > 15 else "NORMAL")
+    data = runs(
+        affine,
+        static_loss,
+        sequence=lambda H, beta: "NORMAL>BATTERY" if beta < 1.1 and H[0] > 15 else "NORMAL",
+    )
     other = int(((data.sequence != "NORMAL") & data.fit & (data.site == 21)).sum())
     f = next(f for f in fit_surrogates(data, "paper") if f.site == 21)
     assert (f.n_mixed, f.n_sequences) == (other, 2)
@@ -202,4 +252,8 @@ def test_unknown_method_is_named() -> None:
 def test_scores_are_the_textbook_ones() -> None:
     s = score([0.3, -0.1, 0.2], [0.1, 0.1, -0.2])
     assert (s.n, s.mae, s.rmse) == (3, pytest.approx(0.8 / 3), pytest.approx(np.sqrt(0.24 / 3)))
-    assert (s.worst_over, s.worst_under, s.violation_rate) == (pytest.approx(0.4), pytest.approx(0.2), pytest.approx(1 / 3))
+    assert (s.worst_over, s.worst_under, s.violation_rate) == (
+        pytest.approx(0.4),
+        pytest.approx(0.2),
+        pytest.approx(1 / 3),
+    )

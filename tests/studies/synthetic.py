@@ -15,7 +15,7 @@ import numpy as np
 from dcvrt.planning import replay
 from dcvrt.planning.sampling import sample_hosting
 from dcvrt.studies import outputs, phases
-from dcvrt.studies.config import StudyFile, load, template
+from dcvrt.studies.config import StudyFile, load
 from dcvrt.studies.store import Store
 
 SITES = (21, 75, 106, 108)
@@ -32,16 +32,27 @@ SLOPE = 1.5e-4
 """Fall of the retained voltage per MW at the site itself, pu; a fifth of it per MW elsewhere."""
 
 
-def study_file() -> StudyFile:
-    """Return the built-in study, cut down to the faults and periods above."""
-    file = load(template(), "template").quick()
-    return file.model_copy(
-        update={
-            "fault": [f for f in file.fault if f.bus in LEAST],
-            "period": [p.model_copy(update={"hour": PERIODS[p.name][0]}) for p in file.period],
-            "sampling": file.sampling.model_copy(update={"n": 16}),
-        }
-    )
+STUDY = """
+[study]
+name = "A study of four sites"
+[grid]
+case = "ieee118"
+sites = [21, 75, 106, 108]
+[facility]
+beta = [1.0, 1.15, 1.35, 1.5]
+[criteria]
+loss_share = 0.10
+[sampling]
+n = 16
+"""
+
+
+def study_file(name: str) -> StudyFile:
+    """Return a study with the faults and periods above."""
+    text = STUDY + "".join(f"[[fault]]\nbus = {bus}\n" for bus in LEAST)
+    text += "".join(f'[[period]]\nname = "{key}"\nhour = {hour}\n' for key, (hour, *_) in PERIODS.items())
+    file = load(text, "synthetic")
+    return file.model_copy(update={"study": file.study.model_copy(update={"name": name})})
 
 
 def retained(fault: int, site: int, H: np.ndarray, d: float) -> float:
@@ -93,8 +104,7 @@ def make(
     failing : the replay finds one per cent less voltage than the samples, so that some plans fail it.
     lost : one sampled task was set aside.
     """
-    file = study_file()
-    file = file.model_copy(update={"study": file.study.model_copy(update={"name": name})})
+    file = study_file(name)
     folder.mkdir(parents=True, exist_ok=True)
     samples = sample_hosting(
         CORNER,
@@ -115,7 +125,7 @@ def make(
         for key, (hour, load_scale, d, wind) in PERIODS.items()
     }
     setting = SimpleNamespace(file=file, sites=SITES, d={key: p["dc_factor"] for key, p in periods.items()})
-    (folder / "study.toml").write_text(template(), encoding="utf-8")
+    (folder / "study.toml").write_text(STUDY, encoding="utf-8")
     with Store(folder / "study.sqlite", write=True) as store:
         _note(store, file, periods)
         for k, H in enumerate(samples.hosting):
@@ -169,7 +179,7 @@ def _note(store: Store, file: StudyFile, periods: dict[str, Any]) -> None:
     store.note(
         study=file.canonical(),
         study_name=file.study.name,
-        study_text=template(),
+        study_text=STUDY,
         quick=True,
         versions={"dcvrt": "0.1.0", "python": "3.11"},
         platform="test",

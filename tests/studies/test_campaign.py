@@ -37,14 +37,21 @@ def tasks(count: int) -> list[Task]:
     return [Task("squares", {"n": n}) for n in range(count)]
 
 
-def run(folder: Path, function, count: int, workers: int, **options) -> tuple[list[str], dict[int, int], list[int]]:
+def run(
+    folder: Path, function, count: int, workers: int, **options
+) -> tuple[list[str], dict[int, int], list[int]]:
     """Messages of lost tasks, results, tasks whose loss was recorded."""
     results: dict[int, int] = {}
     lost: list[int] = []
     with Store(folder / "study.sqlite", write=True) as store, crew_of(workers) as crew:
         campaign = Campaign(store, crew, **options)
-        messages = campaign.run("squares", tasks(count), function, lambda task, r: results.update({r["n"]: r["value"]}),
-                                lambda task, why: lost.append(task.payload["n"]))
+        messages = campaign.run(
+            "squares",
+            tasks(count),
+            function,
+            lambda task, r: results.update({r["n"]: r["value"]}),
+            lambda task, why: lost.append(task.payload["n"]),
+        )
     return messages, results, sorted(lost)
 
 
@@ -74,19 +81,26 @@ def test_a_raising_and_a_slow_task_are_set_aside_in_process(tmp_path: Path) -> N
         return square(payload) if payload["n"] == 3 else fragile(payload)
 
     messages, results, lost = run(tmp_path, gentle, 9, workers=1, timeout_s=0.3)
-    assert lost == [5, 7] and sorted(results) == [0, 1, 2, 3, 4, 6, 8]
+    assert lost == [5, 7]
+    assert sorted(results) == [0, 1, 2, 3, 4, 6, 8]
     assert [m.split(": ", 1)[1] for m in messages] == [
-        "failed: ValueError: five is not welcome", "timeout: took longer than 0.3 s"]
+        "failed: ValueError: five is not welcome",
+        "timeout: took longer than 0.3 s",
+    ]
 
 
 def test_a_poison_task_is_quarantined_and_the_others_finish(tmp_path: Path) -> None:
     messages, results, lost = run(tmp_path, fragile, 9, workers=2, timeout_s=8.0, tries=2)
-    assert lost == [3, 5, 7] and results == {n: n**2 for n in (0, 1, 2, 4, 6, 8)}
+    assert lost == [3, 5, 7]
+    assert results == {n: n**2 for n in (0, 1, 2, 4, 6, 8)}
     assert [m.split(": ", 1)[1] for m in messages] == [
-        "quarantined: its worker died 2 times while doing it", "failed: ValueError: five is not welcome",
-        "timeout: took longer than 8 s"]
+        "quarantined: its worker died 2 times while doing it",
+        "failed: ValueError: five is not welcome",
+        "timeout: took longer than 8 s",
+    ]
     again, results, _ = run(tmp_path, fragile, 9, workers=1, timeout_s=8.0, tries=2)
-    assert again == messages and results == {}, "what was set aside stays so, and is reported again"
+    assert again == messages, "what was set aside stays so, and is reported again"
+    assert results == {}
 
 
 SLOW_RUN = """
@@ -126,11 +140,13 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
         done = set(store.hostings().name)
     assert 0 < len(done) < 12, "the kill has to fall into the campaign"
     begun = log.read_text().split()
-    subprocess.run(command, check=True, timeout=120, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    subprocess.run(
+        command, check=True, timeout=120, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    )
     with Store(tmp_path / "study.sqlite") as store:
         assert list(store.hostings().name) == [f"{n:03}" for n in range(12)]
         assert (store.tasks().status == "done").all()
-    repeated = log.read_text().split()[len(begun):]
+    repeated = log.read_text().split()[len(begun) :]
     assert not {f"{int(n):03}" for n in repeated} & done, "a finished task was done again"
 
 
@@ -138,7 +154,9 @@ def test_a_task_that_took_the_whole_process_down_too_often_is_not_started_again(
     with Store(tmp_path / "study.sqlite", write=True) as store:
         store.add_tasks([(t.key, "squares", t.text) for t in tasks(2)])
         store.count_attempt(tasks(1)[0].key, by=3)
-        messages = Campaign(store, InProcess(), tries=3).run("squares", tasks(2), square, lambda *_: None, lambda *_: None)
+        messages = Campaign(store, InProcess(), tries=3).run(
+            "squares", tasks(2), square, lambda *_: None, lambda *_: None
+        )
     assert [m.split(": ", 1)[1] for m in messages] == ["quarantined: its worker died 3 times while doing it"]
 
 
@@ -153,4 +171,5 @@ def test_a_scheduler_that_does_not_answer_is_named() -> None:
         pass
     assert str(caught.value) == (
         "no dask scheduler answers at 'tcp://127.0.0.1:9' (OSError). "
-        "Way out: start one with 'dask scheduler' and give the address that it prints.")
+        "Way out: start one with 'dask scheduler' and give the address that it prints."
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.style import mode_name, save, styled
@@ -81,9 +81,8 @@ def _internal_response(findings: Findings, mode: str) -> Figure:
     waveform = Waveform.ercot_style()
     dae = findings.facility(mode)
     beta = min(findings.study.facility.beta, key=lambda b: abs(b - TEST_BETA))
-    run = Simulator(dae, save_at=2e-3)(
-        waveform, beta=beta, pf=findings.study.hosting.pf, **findings.parameters(mode)
-    )
+    given: dict[str, Any] = findings.parameters(mode)
+    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf, **given)
     title = (
         f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; "
         "not ERCOT's official waveform)"

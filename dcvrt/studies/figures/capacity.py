@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dcvrt.studies.findings import Findings, Row, by_site, verdict
 from dcvrt.studies.style import (
@@ -152,7 +152,9 @@ def _legend(figure: Figure, axes: Axes, failed: bool) -> None:
     from matplotlib.lines import Line2D
 
     handles = []
-    for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+    lines: list[Any] = list(axes.get_legend_handles_labels()[0])
+    for handle in lines:
+        label = str(handle.get_label())
         plain = label == "without ride-through"
         colour = GREY if plain else INK
         handles.append(

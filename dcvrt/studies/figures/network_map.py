@@ -59,9 +59,8 @@ def draw(
         ([b for b in plain if b in units], INK),
         ([b for b in plain if b not in units], "white"),
     ):
-        axes.scatter(
-            *np.array([at[b] for b in buses]).T, s=9, facecolor=face, edgecolor=INK, linewidth=0.6, zorder=2
-        )
+        x, y = np.array([at[b] for b in buses]).reshape(-1, 2).T
+        axes.scatter(x, y, s=9, facecolor=face, edgecolor=INK, linewidth=0.6, zorder=2)
     ends = [
         (at[int(a)], at[int(b)])
         for a, b in zip(network.branches.from_bus, network.branches.to_bus, strict=True)
@@ -71,7 +70,7 @@ def draw(
     for bus in plain:
         axes.annotate(
             str(bus),
-            at[bus],
+            (at[bus][0], at[bus][1]),
             np.array([3.2 + 1.3 * len(str(bus)), 5.2]) * towards[bus],
             textcoords="offset points",
             fontsize=4.8,
@@ -117,12 +116,11 @@ def _symbols(
     edge: str,
 ) -> None:
     for bus in buses:
-        axes.scatter(
-            *at[bus], s=area, marker=marker, facecolor=colour, edgecolor=edge, linewidth=0.7, zorder=5
-        )
+        x, y = at[bus]
+        axes.scatter(x, y, s=area, marker=marker, facecolor=colour, edgecolor=edge, linewidth=0.7, zorder=5)
         axes.annotate(
             str(bus),
-            at[bus],
+            (x, y),
             (0.55 * area**0.5 + np.array([3.0 + 2.2 * len(str(bus)), 5.0])) * towards[bus],
             textcoords="offset points",
             fontsize=7.5,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dcvrt.studies.style import GREY, INK, PAGE, mode_band, new_figure
 
@@ -196,7 +196,7 @@ def _edge(axes: Axes, start: tuple[float, float], end: tuple[float, float], text
         arrowprops=dict(arrowstyle="-|>", color=INK, linewidth=1.1, shrinkA=0, shrinkB=1, mutation_scale=10),
     )
     middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
-    style = dict(fontsize=7.2, linespacing=1.45, zorder=5)
+    style: dict[str, Any] = dict(fontsize=7.2, linespacing=1.45, zorder=5)
     if abs(dy) < 1e-9:  # along a side of the rectangle: above the upper lane, below the lower one
         above = shift[1] > 0 or (lane == 0 and start[1] < _HEIGHT / 2)
         axes.text(

@@ -37,7 +37,7 @@ UNITS = {
 
 
 def draw(findings: Findings) -> Figure:
-    """True against predicted margin after tightening, a row a method, a column a target; false passes ringed."""
+    """True against predicted margin after tightening, a row a method, a column a target."""
     points = findings.predictions
     methods = [m for m in findings.methods if (points.method == m).any()]
     figure = new_figure(PAGE, 0.45 + 2.55 * max(len(methods), 1))

@@ -10,11 +10,14 @@ from dcvrt.studies.report.page import Safe, figure, number, paragraph, section, 
 def grid(findings: Findings) -> Safe:
     """Network, sites, faults with what they do to each site, and the hours that they are simulated in."""
     table_of = retained(findings.margins)
-    lowest = {(row.fault, row.site): (row.min, row.max) for row in table_of.itertuples()}
-    hardest = {
-        site: min((f for f, s in lowest if s == site), key=lambda f, s=site: lowest[f, s][0], default="")
-        for site in findings.sites
+    lowest: dict[tuple[str, int], tuple[float, float]] = {
+        (str(row["fault"]), int(row["site"])): (float(row["min"]), float(row["max"]))
+        for row in table_of.to_dict("records")
     }
+    hardest = {}
+    for site in findings.sites:
+        ranked = sorted((low, fault) for (fault, bus), (low, _) in lowest.items() if bus == site)
+        hardest[site] = ranked[0][1] if ranked else ""
     fault_rows = []
     for fault in findings.faults:
         name = fault_name(fault)

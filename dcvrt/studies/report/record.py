@@ -34,7 +34,7 @@ def simulations(findings: Findings) -> Safe:
             table(
                 "Tasks that were set aside",
                 ["task", "phase", "state", "message"],
-                [[task.hash[:12], task.phase, task.status, task.message] for task in away.itertuples()],
+                [[str(task.hash)[:12], task.phase, task.status, task.message] for task in away.itertuples()],
                 words=[1, 2, 3],
             )
         )

@@ -1,0 +1,238 @@
+"""The study file: what is right is read, what is wrong is told all at once, before anything runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dcvrt.errors import InputError
+from dcvrt.studies import checks, config
+from dcvrt.studies.tables import read_profiles
+
+HERE = Path()
+
+
+def changed(*replacements: tuple[str, str]) -> str:
+    """The shipped study file with some of its text replaced; each must be there."""
+    text = config.template()
+    for old, new in replacements:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+def complaint(text: str, folder: Path = HERE) -> str:
+    with pytest.raises(InputError) as caught:
+        checks.check(text, "my.toml", folder)
+    return str(caught.value)
+
+
+def test_the_shipped_study_is_in_order_and_is_what_the_defaults_describe() -> None:
+    file = checks.check(config.template(), "ieee118.toml", HERE)
+    assert file.grid.sites == [21, 75, 106, 108]
+    assert len(file.fault) >= 6
+    assert len(file.period) >= 3
+    assert file.facility.beta[0] == 1.0
+    assert file.facility.beta[-1] == 1.5
+    assert not {f.bus for f in file.fault} & set(file.grid.sites)
+
+
+def test_quick_keeps_faults_sites_and_modes() -> None:
+    file = config.load(config.template(), "ieee118.toml")
+    quick = file.quick()
+    assert (quick.fault, quick.grid, quick.facility.modes) == (file.fault, file.grid, file.facility.modes)
+    assert quick.sampling.n < file.sampling.n
+    assert len(quick.period) < len(file.period)
+    assert set(quick.facility.beta) < set(file.facility.beta)
+    assert quick.facility.beta[-1] == file.facility.beta[-1]
+    checks.check(config.template(), "quick", HERE)
+    assert not checks.contradictions({name: getattr(quick, name) for name in config.StudyFile.model_fields})
+
+
+def test_the_canonical_form_leaves_out_what_decides_nothing() -> None:
+    file = config.load(config.template(), "a")
+    renamed = config.load(
+        changed(("IEEE-118 with", "Another name for"), ("task_timeout_s = 600.0", "task_timeout_s = 9.0")),
+        "a",
+    )
+    reseeded = config.load(changed(("seed = 1", "seed = 2")), "a")
+    assert file.canonical() == renamed.canonical() != reseeded.canonical()
+
+
+def test_schema_is_json_and_knows_every_table() -> None:
+    schema = json.loads(config.schema())
+    assert set(schema["properties"]) == set(config.StudyFile.model_fields)
+
+
+def test_every_mistake_of_fields_is_told_at_once() -> None:
+    text = changed(
+        ("sites = [21,", 'sitez = 3\nsites = ["a",'),
+        ("pf = 0.98", "pf = 1.2"),
+        ("t_clear_ms = 100.0", "t_clear_ms = -5.0"),
+        ('hour = "peak"', 'hour = "peek"'),
+        ("[run]", "[runn]"),
+        ("n = 24", "n = 3.5"),
+    )
+    assert complaint(text) == (
+        "my.toml: 7 problems\n"
+        "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
+        "sampling, surrogate, run, "
+        "fault, period.\n"
+        "  grid.sites[1] = 'a': must be a whole number.\n"
+        "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "
+        "step_s, redispatch.\n"
+        "  hosting.pf = 1.2: must be at most 1.\n"
+        "  sampling.n = 3.5: must be a whole number.\n"
+        "  fault[1].t_clear_ms = -5.0: must be above 0.\n"
+        "  period[1].hour = 'peek': must be a whole number, or 'peak', 'median' or 'light'."
+    )
+
+
+def test_missing_tables_are_named() -> None:
+    assert complaint('[study]\nname = "x"') == (
+        "my.toml: 3 problems\n"
+        "  grid: this table is required.\n"
+        "  fault: at least one [[fault]] is required.\n"
+        "  period: at least one [[period]] is required."
+    )
+
+
+def test_what_is_not_toml_says_where() -> None:
+    assert (
+        complaint("[study\n")
+        == "my.toml: not a TOML file: Expected ']' at the end of a table declaration (at line 1, column 7)."
+    )
+
+
+def test_unknown_bus() -> None:
+    assert complaint(changed(("sites = [21, 75,", "sites = [21, 755,"), ("bus = 25 ", "bus = 999 "))) == (
+        "my.toml: 2 problems\n"
+        "  grid.sites[2] = 755: ieee118 has no such bus. Did you mean '75'? Known: 1, 2, 3, 4, 5, 6, 7, 8, "
+        "9, 10, 11, 12, ... "
+        "(118 in all).\n"
+        "  fault[1].bus = 999: ieee118 has no such bus. Did you mean '99'? Known: 1, 2, 3, 4, 5, 6, 7, 8, "
+        "9, 10, 11, 12, ... (118 in all)."
+    )
+
+
+def test_fault_at_a_candidate_bus() -> None:
+    assert complaint(changed(("bus = 25 ", "bus = 75 "))) == (
+        "my.toml: fault[1].bus = 75: is a candidate bus; a site cannot ride through a fault at its own "
+        "terminals. "
+        "Way out: take a neighbouring bus, or drop it from grid.sites."
+    )
+
+
+def test_negative_capacity() -> None:
+    assert complaint(changed(("# h_max_mw = [30.0, 150.0,", "h_max_mw = [30.0, -150.0,"))) == (
+        "my.toml: sampling.h_max_mw[2] = -150.0: must be at least 0."
+    )
+
+
+def test_parameter_out_of_bounds_and_unknown() -> None:
+    text = changed(('# "sup.T_dip" = 0.25', '"sup.V_dip" = 2.0\n"sup.V_dipp" = 0.9\nbeta = 1.2'))
+    found = complaint(text).splitlines()
+    assert found[0] == "my.toml: 4 problems"
+    assert found[1] == '  facility.parameters."sup.V_dip" = 2 pu(V): is outside [0.3, 1].'
+    assert found[2].startswith(
+        "  facility.parameters.\"sup.V_dipp\": variant 'gfl' has no such parameter. Did you mean "
+        "'sup.V_dip'? Known:"
+    )
+    assert (
+        found[3] == '  facility.parameters."beta": is set by the study in every run and cannot be fixed here.'
+    )
+
+
+def test_fields_that_contradict_each_other() -> None:
+    text = changed(
+        ("t_end_s = 2.0", "t_end_s = 0.25"),
+        ("v_min_pu = 0.94", "v_min_pu = 1.2"),
+        ("beta = [1.0, 1.05", "beta = [1.3, 1.05"),
+        ('name = "median"', 'name = "peak"'),
+        ("bus = 30 ", "bus = 25 "),
+        ("n = 24", "n = 7"),
+        ('modes = ["gfl", "gfm"]', 'modes = ["gfl", "gfn"]'),
+        ('hour = "light"', "hour = 9000"),
+        ("# h_max_mw = [30.0, 150.0, 100.0,", "h_max_mw = [30.0, 150.0,"),
+    )
+    assert complaint(text).splitlines()[1:] == [
+        *(
+            f"  fault[{k}]: is cleared at 0.3 s, after the end of the simulation at 0.25 s. Way out: raise "
+            f"grid.t_end_s."
+            for k in range(1, 8)
+        ),
+        "  sampling.h_max_mw: 3 values for 4 sites.",
+        "  sampling.n = 7: leaves 5 hosting vectors to fit a margin of 4 sites, 6 are needed. Way out: "
+        "raise sampling.n or lower "
+        "sampling.validation_share.",
+        "  fault: two faults at bus 25 are cleared after 100 ms; results could not tell them apart.",
+        "  period: the name 'peak' is used more than once.",
+        "  hosting.v_min_pu = 1.2: must be below v_max_pu = 1.06.",
+        "  facility.beta = [1.3, 1.05, 1.1, 1.125, 1.15, 1.175, 1.2, 1.25, 1.3, 1.35, 1.4, 1.5]: must rise "
+        "from one value to the next.",
+        "  period[3].hour = 9000: is not among the 8760 operating hours (0 to 8759).",
+        "  facility.modes: no variant 'gfn'. Did you mean 'gfm'? Known: gfl, gfm.",
+    ]
+
+
+def test_case_without_dynamic_data(tmp_path: Path) -> None:
+    (tmp_path / "north.raw").write_text("0, 100.0\n")
+    assert complaint(changed(('case = "ieee118"', 'case = "north.raw"')), tmp_path) == (
+        "my.toml: grid.case = 'north.raw': a .raw file has no dynamic data (machines, exciters, governors), "
+        "without which no "
+        'fault can be simulated. Way out: give grid.dynamics = "FILE.dyr", or a case that has both (.xlsx '
+        "or .json of ANDES)."
+    )
+
+
+@pytest.mark.slow
+def test_case_file_without_machines(tmp_path: Path) -> None:
+    from dcvrt.grid import andes
+
+    (tmp_path / "bare.m").write_text(andes.case118().read_text())
+    found = complaint(changed(('case = "ieee118"', 'case = "bare.m"')), tmp_path)
+    assert found.startswith(
+        "my.toml: grid.case = 'bare.m': bare, base: the case has no dynamic data, not one machine. Way out:"
+    )
+
+
+def test_unknown_case_and_missing_dynamics() -> None:
+    assert complaint(changed(('case = "ieee118"', 'case = "ieee181"'))) == (
+        "my.toml: grid.case = 'ieee181': no such file and no such built-in case. Did you mean 'ieee118'? "
+        "Known: ieee118. "
+        "Way out: 'ieee118', or the path of a case with dynamic data, from the folder of the study file."
+    )
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        ("hour,load\n0,1.0\n", "no column 'dc'. It has: hour, load."),
+        ("hour,load,dc\n0,1.0,x\n", "column 'dc': could not convert string to float: 'x'."),
+        ("hour,load,dc,wind\n0,1.0,1.0,3\n", "column 'wind' is none of hour, load, dc, wind_<bus>_mw."),
+        ("hour,load,dc\n0,1.0\n", "line 2 has 2 cells, the header has 3."),
+        ("hour,load,dc\n0.5,1.0,1.0\n", "column 'hour' must hold whole numbers."),
+        ("", "is empty."),
+    ],
+)
+def test_bad_profiles_are_told(tmp_path: Path, table: str, told: str) -> None:
+    (tmp_path / "hours.csv").write_text(table)
+    with pytest.raises(InputError) as caught:
+        read_profiles(tmp_path / "hours.csv")
+    assert str(caught.value) == f"hours.csv: {told}"
+
+
+def test_profiles_are_read_with_their_wind(tmp_path: Path) -> None:
+    (tmp_path / "hours.csv").write_text("hour,load,dc,wind_80_mw\n10,0.9,1.0,55.5\n11,0.8,0.9,0\n")
+    year = read_profiles(tmp_path / "hours.csv")
+    assert year.hours.tolist() == [10, 11]
+    assert year.at(10).wind == {80: 55.5}
+    assert year.at(11).dc == 0.9
+
+
+def test_profiles_of_a_study_may_be_missing(tmp_path: Path) -> None:
+    assert complaint(changed(('profiles = "ieee118"', 'profiles = "hours.csv"')), tmp_path) == (
+        "my.toml: hosting.profiles = 'hours.csv': hours.csv: no such file."
+    )

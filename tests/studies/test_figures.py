@@ -1,0 +1,308 @@
+"""The figures of a study: all drawn, readable, reproducible, and saying what the store says."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dcvrt import facility
+from dcvrt.errors import InputError
+from dcvrt.grid.network import Network
+from dcvrt.studies.figures import capacity, draw_all, faults, layout, supervisor, validation, worst
+from dcvrt.studies.findings import Findings, by_site, closed, verdict
+from dcvrt.studies.store import Store
+from dcvrt.studies.style import HATCHES, MARKERS, PALETTE, styled
+from tests.studies.synthetic import LEAST, PERIODS, SITES, make, retained
+
+NAMES = {
+    "framework",
+    "capacity",
+    "allocation",
+    "validation",
+    "retained_voltage",
+    "network_map",
+    "worst_case_gfl",
+    "worst_case_gfm",
+    "internal_response_gfl",
+    "internal_response_gfm",
+    "supervisor",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def drawn(folder: Path) -> list[Path]:
+    (folder / "figures").mkdir()
+    (folder / "figures" / "old.svg").write_text("<svg/>", encoding="utf-8")
+    return draw_all(folder)
+
+
+def texts_of(figure: object) -> list[str]:
+    """Every text that a figure shows."""
+    from matplotlib.text import Text
+
+    return [t.get_text() for t in figure.findobj(Text) if t.get_visible() and t.get_text()]  # type: ignore[attr-defined]
+
+
+# -- all of them --------------------------------------------------------------------------------------------
+
+
+def test_every_figure_is_written_as_svg_and_png(folder: Path, drawn: list[Path]) -> None:
+    assert {p.stem for p in drawn} == NAMES
+    assert {p.suffix for p in drawn} == {".svg", ".png"}
+    assert sorted(drawn) == sorted((folder / "figures").iterdir()), (
+        "a figure of an earlier run is left behind"
+    )
+
+
+def test_svg_is_well_formed_and_refers_to_nothing_outside(drawn: list[Path]) -> None:
+    for path in drawn:
+        if path.suffix == ".svg":
+            root = ET.fromstring(path.read_text(encoding="utf-8"))
+            for element in root.iter():
+                for key, value in element.attrib.items():
+                    if key.endswith("href"):
+                        assert value.startswith(("#", "data:image/png;base64,")), f"{path.name}: {value[:60]}"
+
+
+def test_the_same_study_gives_the_same_bytes(folder: Path, drawn: list[Path]) -> None:
+    before = {p: p.read_bytes() for p in drawn}
+    assert {p: p.read_bytes() for p in draw_all(folder)} == before
+
+
+def test_no_text_is_smaller_than_can_be_read_in_print(folder: Path) -> None:
+    from matplotlib.text import Text
+
+    findings = Findings(folder)
+    with styled():
+        for figure in (
+            capacity.draw_totals(findings),
+            capacity.draw_allocation(findings),
+            validation.draw(findings),
+            faults.draw(findings),
+        ):
+            assert min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text()) >= 6.0
+
+
+def test_unfinished_study_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        draw_all(tmp_path)
+    assert str(error.value) == (
+        f"{tmp_path}: summary.json and study.sqlite not found, so this is not the folder of a study that has "
+        "ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes."
+    )
+
+
+def test_colours_can_be_told_apart_by_lightness_or_marker() -> None:
+    assert len(set(PALETTE)) == len(PALETTE) == len(set(MARKERS)) == len(set(HATCHES))
+
+
+# -- capacity -----------------------------------------------------------------------------------------------
+
+
+def test_totals_are_those_of_the_summary_and_failed_plans_are_crossed(folder: Path) -> None:
+    findings = Findings(folder)
+    with styled():
+        figure = capacity.draw_totals(findings)
+    assert any(verdict(row) == "failed" for row in findings.rows())
+    for axes, mode in zip(figure.axes, findings.modes, strict=True):
+        lines = {line.get_label(): line for line in axes.get_lines()}
+        for method in findings.methods:
+            line = lines[capacity.METHOD_TEXT[method]]
+            assert [*line.get_ydata()] == [row["total_mw"] for row in findings.rows(mode, method)]
+        assert lines["without ride-through"].get_ydata()[0] == findings.no_vrt_mw
+        crosses = sorted(
+            (float(x), float(y))
+            for line in axes.get_lines()
+            if line.get_marker() == "x"
+            for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)
+        )
+        failed = sorted((r["beta"], r["total_mw"]) for r in findings.rows(mode) if verdict(r) == "failed")
+        assert crosses == failed
+
+
+def test_stacks_add_up_to_the_total(folder: Path) -> None:
+    findings = Findings(folder)
+    with styled():
+        figure = capacity.draw_allocation(findings)
+    places = [(method, mode) for method in findings.methods for mode in findings.modes]
+    for axes, (method, mode) in zip(figure.axes, places, strict=True):
+        rows = findings.rows(mode, method)
+        tops = np.array([bar.get_y() + bar.get_height() for bar in axes.patches]).reshape(
+            len(SITES), len(rows)
+        )
+        assert tops[-1] == pytest.approx([row["total_mw"] for row in rows])
+        heights = np.array([bar.get_height() for bar in axes.patches]).reshape(len(SITES), len(rows))
+        assert pytest.approx(np.array([by_site(row, findings.sites) for row in rows])) == heights.T
+
+
+# -- validation ---------------------------------------------------------------------------------------------
+
+
+def test_fitting_points_lie_on_or_below_the_simulated_margins(folder: Path) -> None:
+    """Tightening lowers every fit by its largest overprediction: no fitting point is overpredicted."""
+    findings = Findings(folder)
+    for method in findings.methods:
+        for target in ("voltage", "loss"):
+            margin, predicted = validation.fitted_points(findings, method, target)
+            fits = findings.surrogates
+            chosen = fits[(fits.method == method) & (fits.target == target)]
+            assert len(margin) == chosen.n_fit.sum()
+            assert (predicted - margin).max() <= 1e-9
+            assert (predicted - margin).max() >= -1e-9, "the tightest fitting point should be met"
+
+
+def test_false_passes_are_ringed_and_counted(tmp_path: Path) -> None:
+    make(tmp_path)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        points = store.predictions()
+        wrong = points[(points.method == "share") & (points.target == "loss") & (points.margin < 0)].iloc[:3]
+        store.put("predictions", [row | {"predicted": 0.01} for row in wrong.to_dict("records")])
+    with styled():
+        figure = validation.draw(Findings(tmp_path))
+    counts = [re.search(r"validation: (\d+) false", text) for text in texts_of(figure)]
+    assert [int(found[1]) for found in counts if found] == [0, 0, 0, 3]
+    rings = [line for line in figure.axes[3].get_lines() if line.get_markerfacecolor() == "none"]
+    assert sum(len(line.get_xdata()) for line in rings) == 3
+
+
+# -- voltages and waveforms ---------------------------------------------------------------------------------
+
+
+def test_retained_voltage_is_the_one_of_the_store(folder: Path) -> None:
+    with Store(folder / "study.sqlite") as store:
+        samples = store.hostings().query("role == 'sample'").by_site
+        table = faults.retained(store.margins("sample")).set_index(["fault", "site"])
+    vectors = [np.array([H[str(site)] for site in SITES]) for H in samples]
+    for bus in LEAST:
+        for site in SITES:
+            volts = [retained(bus, site, H, d) for H in vectors for _, _, d, _ in PERIODS.values()]
+            row = table.loc[(f"bus {bus}, 100 ms", site)]
+            assert (row["min"], row["max"]) == pytest.approx((min(volts), max(volts)), abs=1e-12)
+
+
+def test_rating_line_is_the_static_loss_law() -> None:
+    for beta in (1.0, 1.2, 1.5):
+        v = faults.rating_line(beta, 0.1)
+        assert 1.0 - min(1.0, beta * v) == pytest.approx(0.1)
+
+
+def test_worst_case_is_the_least_margin_of_the_kept_runs(folder: Path) -> None:
+    findings = Findings(folder)
+    case = findings.worst_case("gfl")
+    assert case is not None
+    kept = {
+        (k["hosting"], k["period"], k["fault"], k["site"], k["beta"])
+        for k, _ in findings.waveforms(mode="gfl")
+    }
+    runs = findings.margins[findings.margins["mode"] == "gfl"]
+    least = min(
+        min(r.v_margin_pu, r.loss_margin_share)
+        for r in runs.itertuples()
+        if (r.hosting, r.period, r.fault, r.site, r.beta) in kept
+    )
+    assert min(case.v_margin_pu, case.loss_margin_share) == least
+    with styled():
+        figure = worst.draw(findings, case)
+    assert f"bus {case.site} (worst)" in texts_of(figure)
+    assert len([line for line in figure.axes[0].get_lines() if str(line.get_label()).startswith("bus ")]) == 4
+
+
+# -- supervisor ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", ["gfl", "gfm"])
+def test_supervisor_diagram_shows_every_row_of_the_table(variant: str) -> None:
+    dae = facility.get(variant).compile()
+    table = dae.automata[0]
+    with styled():
+        shown = "\n".join(texts_of(supervisor.draw(dae)))
+    for mode in table.modes:
+        assert mode in shown
+    for number, row in enumerate(table.rows, 1):
+        assert f"{number}  {supervisor.guard_text(row.text)}" in shown
+    for row in dae.parameter_rows:
+        if row.path.startswith(f"{table.path}.") and row.path.split(".")[1] in " ".join(
+            r.text for r in table.rows
+        ):
+            assert f"= {row.value:g}" in shown
+
+
+# -- map ----------------------------------------------------------------------------------------------------
+
+
+def test_shipped_coordinates_are_the_computed_ones() -> None:
+    network = Network.ieee118()
+    assert layout.positions(network) == pytest.approx(layout.computed(network), abs=0.05)
+
+
+def test_majorisation_never_raises_the_stress() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(12, 2))
+    target = rng.normal(size=(12, 2))
+    distance = np.linalg.norm(target[:, None] - target[None], axis=2)
+    values = [layout.stress(distance, x)]
+    for _ in range(30):
+        x = layout.majorised(distance, x, 1)
+        values.append(layout.stress(distance, x))
+    assert (np.diff(values) <= 1e-12).all()
+    assert values[-1] < 0.5 * values[0]
+
+
+def test_classical_scaling_recovers_a_plane() -> None:
+    target = np.random.default_rng(5).normal(size=(9, 2))
+    distance = np.linalg.norm(target[:, None] - target[None], axis=2)
+    assert layout.stress(distance, layout.classical(distance)) == pytest.approx(0.0, abs=1e-18)
+
+
+def test_buses_do_not_cover_each_other_on_the_map() -> None:
+    x = layout.positions(Network.ieee118())
+    apart = np.linalg.norm(x[:, None] - x[None], axis=2) + 9.0 * np.eye(len(x))
+    assert apart.min() > 0.2
+
+
+# -- statements ---------------------------------------------------------------------------------------------
+
+
+def test_shortfall_names_what_closes_sites(folder: Path) -> None:
+    findings = Findings(folder)
+    said = findings.shortfalls()
+    short = [
+        r
+        for r in findings.rows()
+        if r["beta"] == 1.5 and r["total_mw"] < findings.no_vrt_mw - findings.tolerance_mw
+    ]
+    assert len(said) == len(short) > 0
+    for text, row in zip(said, short, strict=True):
+        assert f"{row['total_mw']:.1f} MW" in text
+        for bus, why in closed(row).items():
+            assert f"us {bus} is closed: {why}" in text
+
+
+def test_falls_are_found_and_only_where_they_are(folder: Path) -> None:
+    findings = Findings(folder)
+    assert findings.falls() == []
+    rows = findings.rows("gfm", "share")
+    rows[-1]["total_mw"] = rows[-2]["total_mw"] - 5.0
+    said = findings.falls()
+    assert len(said) == 1
+    assert "GFM, method share: capacity falls from" in said[0]
+    assert "at β = 1.5" in said[0]
+
+
+def test_best_plan_has_passed_everything(folder: Path) -> None:
+    findings = Findings(folder)
+    best = findings.best()
+    assert best is not None
+    assert best["replay"]["passed"]
+    assert best["ac"]["passed"]
+    larger = [r for r in findings.rows() if r["total_mw"] > best["total_mw"] + findings.tolerance_mw]
+    assert all(verdict(r) == "failed" for r in larger)

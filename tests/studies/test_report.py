@@ -1,0 +1,195 @@
+"""The report: one offline file that says first what was asked and hides nothing that failed."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from dcvrt.studies import outputs
+from dcvrt.studies.findings import Findings, verdict
+from dcvrt.studies.report import write_report
+from dcvrt.studies.store import Store
+from tests.studies.synthetic import make
+
+VOID = {"meta", "br", "path", "use", "rect", "image", "line", "circle", "img", "hr", "link"}
+HOSTILE = 'Sites <script>alert("x")</script> & "more"'
+
+
+class Page(HTMLParser):
+    """Collects elements, visible text and nesting errors."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == [], f"not closed: {self.open[-5:]}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {k: v or "" for k, v in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {k: v or "" for k, v in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in VOID:
+            return
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag, f"</{tag}> closes another element"
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open[-1:]:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = make(tmp_path_factory.mktemp("study"), lost=True, name=HOSTILE)
+    write_report(folder)
+    return folder
+
+
+def page_of(study: Path, pictures: Path) -> Page:
+    """The report of a study, with the pictures of another one, which saves the time to draw them."""
+    shutil.copytree(pictures / "figures", study / "figures")
+    write_report(study)
+    return Page((study / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def source(folder: Path) -> str:
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(source: str) -> Page:
+    return Page(source)
+
+
+def test_report_is_one_file_that_needs_no_network(source: str, page: Page) -> None:
+    assert page.all("link") == []
+    assert page.all("script") == []
+    assert page.all("img") == []
+    for _, attributes in page.elements:
+        for key in ("src", "href", "xlink:href"):
+            assert attributes.get(key, "#").startswith(("#", "data:image/png;base64,"))
+    assert "@import" not in source
+    assert re.findall(r"url\((?!#)", source) == []
+
+
+def test_links_lead_to_places_on_the_page_and_ids_are_unique(page: Page) -> None:
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    for attributes in page.all("a"):
+        assert attributes["href"].removeprefix("#") in ids
+
+
+def test_text_of_the_study_is_escaped(source: str, page: Page) -> None:
+    assert "<script>" not in source
+    assert html.escape(HOSTILE, quote=True) in source
+    assert HOSTILE in page.text
+
+
+def test_tables_have_captions_and_headers_and_pictures_have_texts(page: Page) -> None:
+    assert len(page.all("table")) == len(page.all("caption")) >= 8
+    assert all(attributes.get("scope") in ("col", "row") for attributes in page.all("th"))
+    pictures = page.all("svg")
+    assert len(pictures) == 11
+    assert all(attributes["role"] == "img" and len(attributes["aria-label"]) > 20 for attributes in pictures)
+    assert page.all("html")[0]["lang"] == "en"
+    assert [attributes["content"] for attributes in page.all("meta") if attributes.get("name") == "viewport"]
+
+
+def test_answer_comes_first_and_is_the_best_plan(folder: Path, page: Page) -> None:
+    best = Findings(folder).best()
+    assert best is not None
+    assert f"{best['total_mw']:.1f} MW of data-centre load can be hosted with ride-through" in page.text
+    assert page.text.index("The answer") < page.text.index("Plans by method, mode and rating")
+
+
+def test_every_row_of_the_summary_stands_in_the_table(folder: Path, source: str) -> None:
+    table = source[source.index("<caption>Plans by method") :]
+    table = table[: table.index("</table>")]
+    rows = re.findall(r"<tr(?: class=\"marked\")?>(<th scope=\"row\".*?)</tr>", table)
+    findings = Findings(folder)
+    assert len(rows) == len(findings.rows()) + 1
+    cells = [re.sub("<[^>]+>", "|", row) for row in rows]
+    for row in findings.rows():
+        assert any(
+            f"{row['beta']:g}" in c and row["method"] in c and f"{row['total_mw']:.2f}" in c for c in cells
+        )
+
+
+def test_failed_replays_and_lost_simulations_are_in_plain_sight(
+    folder: Path, source: str, page: Page
+) -> None:
+    failed = [row for row in Findings(folder).rows() if verdict(row) == "failed"]
+    assert failed
+    assert f"{len(failed)} plan(s) failed the replay and must not be used" in page.text
+    assert source.count('<span class="badge bad">FAILED</span>') >= 2 * len(failed)
+    assert "1 task(s) were set aside" in page.text
+    assert "took longer than 600 s" in page.text
+    assert "Every plan that hosts anything passed the replay." not in page.text
+
+
+def test_shortfall_is_told_with_its_reason(page: Page) -> None:
+    assert "The highest β does not reach the capacity without ride-through" in page.text
+    assert "What prevents more: Bus" in page.text
+
+
+def test_clean_study_says_so(tmp_path: Path, folder: Path) -> None:
+    text = page_of(make(tmp_path, failing=False), folder).text
+    assert "Every plan that hosts anything passed the replay." in text
+    assert "must not be used" not in text
+    assert "Some simulations have no result" not in text
+
+
+def test_nothing_hosted_is_an_answer(tmp_path: Path, folder: Path) -> None:
+    make(tmp_path)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        plans = store.plans().to_dict("records")
+        store.put("plans", [plan | {"passed": 0} for plan in plans if plan["method"] != "none"])
+        outputs.write_results(tmp_path, store)
+    text = page_of(tmp_path, folder).text
+    assert "No data-centre load can be hosted at the sites studied" in text
+
+
+def test_false_passes_are_told(tmp_path: Path, folder: Path) -> None:
+    make(tmp_path)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        points = store.predictions()
+        wrong = points[(points.method == "share") & (points["mode"] == "gfm") & (points.margin < 0)].iloc[:2]
+        store.put("predictions", [row | {"predicted": 1e-3} for row in wrong.to_dict("records")])
+    text = page_of(tmp_path, folder).text
+    assert "False passes: margins that a fit passes and the simulation does not" in text
+    assert "method share, GFM, load loss: 2 validation point(s)" in text
+
+
+def test_assumptions_name_what_is_illustrative_and_the_modes_differences(page: Page) -> None:
+    assert "parameters are illustrative" in page.text
+    assert "Parameters that differ between the modes" in page.text
+    assert "dc_loop.K_p" in page.text
+    assert "not ERCOT's official one" in page.text
+    assert "Positive sequence only." in page.text
+
+
+def test_every_deviation_of_the_models_is_listed(folder: Path, page: Page) -> None:
+    findings = Findings(folder)
+    for mode in findings.modes:
+        for note in findings.facility(mode).notes:
+            assert re.sub(r"\s+", " ", note.partition(": ")[2]) in page.text

@@ -1,0 +1,223 @@
+"""The command line: answers at once, one clear message for each mistake, exit codes that scripts can use."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from dcvrt import __version__
+from dcvrt.cli import main
+from dcvrt.errors import InfeasibleError, InputError, SimulationError
+
+HEAVY = (
+    "numpy",
+    "scipy",
+    "casadi",
+    "andes",
+    "highspy",
+    "pandas",
+    "matplotlib",
+    "dask",
+    "distributed",
+    "pydantic",
+)
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments))
+    return int(ended.value.code or 0)
+
+
+def study(folder: Path, *replacements: tuple[str, str]) -> Path:
+    from dcvrt.studies.config import template
+
+    text = template()
+    for old, new in replacements:
+        assert old in text
+        text = text.replace(old, new, 1)
+    (folder / "my.toml").write_text(text)
+    return folder / "my.toml"
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from dcvrt.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as end: assert not end.code\n"
+        f"print('loaded:', [name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.stdout.splitlines()[-1] == "loaded: []"
+    for command in ("study", "ride", "facility", "doctor"):
+        assert command in done.stdout
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"dcvrt {__version__}\n"
+
+
+def test_a_new_study_file_is_in_order_and_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.toml"
+    assert run("study", "new", str(file)) == 0
+    assert tomllib.loads(file.read_text())["grid"]["sites"] == [21, 75, 106, 108]
+    assert run("study", "check", str(file)) == 0
+    assert "in order: 4 sites, 7 faults, 3 periods, 2 modes" in capsys.readouterr().out
+    file.write_text("mine")
+    assert run("study", "new", str(file)) == 2
+    assert capsys.readouterr().err == f"{file} exists already. Way out: another name; nothing was written.\n"
+    assert file.read_text() == "mine"
+
+
+def test_a_bad_study_file_is_one_message_and_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = study(tmp_path, ("bus = 25 ", "bus = 75 "), ("pf = 0.98", "pf = -1.0"))
+    out = tmp_path / "out"
+    for command in (("study", "check", str(file)), ("study", "run", str(file), "--out", str(out))):
+        assert run(*command) == 2
+        said = capsys.readouterr()
+        assert said.err.splitlines() == [
+            f"{file}: 2 problems",
+            "  hosting.pf = -1.0: must be above 0.",
+            "  fault[1].bus = 75: is a candidate bus; a site cannot ride through a fault at its own "
+            "terminals. "
+            "Way out: take a neighbouring bus, or drop it from grid.sites.",
+        ]
+    assert not out.exists(), "nothing is written for a study that cannot run"
+
+
+def test_an_infeasible_base_case_is_code_3_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = study(tmp_path, ("rating_scale = 0.6", "rating_scale = 0.2"))
+    assert run("study", "run", str(file), "--out", str(tmp_path / "out"), "--workers", "1") == 3
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert "hour" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_workers_is_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("study", "run", "--workers", "0", "--out", str(tmp_path / "out")) == 2
+    assert "workers = 0: needs at least 1." in capsys.readouterr().err
+
+
+def test_a_report_needs_a_study_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("study", "report", str(tmp_path)) == 2
+    assert capsys.readouterr().err == (
+        f"{tmp_path / 'study.sqlite'}: no study store. Way out: name a folder that "
+        "'dcvrt study run' has made.\n"
+    )
+
+
+def test_a_missing_study_file_says_how_to_get_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "none.toml"
+    assert run("study", "check", str(file)) == 2
+    assert (
+        capsys.readouterr().err
+        == f"{file}: no such study file. Way out: 'dcvrt study new {file}' writes one to edit.\n"
+    )
+
+
+def test_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("study", "schema") == 0
+    assert '"title": "dcvrt study"' in capsys.readouterr().out
+
+
+def test_facility_list_and_sheet(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("facility", "list") == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()][:2] == ["gfl", "gfm"]
+    assert run("facility", "sheet", "gfl") == 0
+    assert "V_dip" in capsys.readouterr().out
+    assert run("facility", "sheet", "gfx") == 2
+    assert capsys.readouterr().err.startswith("there is no facility variant 'gfx'. Did you mean 'gf")
+
+
+def test_ride_shows_margins_and_events_and_writes_signals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("ride", "gfl", "--waveform", "sag-70", "--beta", "1.3", "--out", str(tmp_path / "ride")) == 0
+    said = capsys.readouterr().out
+    assert "status: completed" in said
+    assert "voltage margin: +" in said
+    assert "NORMAL -> MIXED" in said
+    base, header, first = (tmp_path / "ride" / "signals.csv").read_text().splitlines()[:3]
+    assert base.startswith("# per unit")
+    assert header.startswith("t_s,v_it,p_g")
+    assert first.startswith("0.000000,")
+    assert (tmp_path / "ride" / "signals.svg").read_text().startswith("<?xml")
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        ("t,u\n0,1\n1,1\n", "voltage"),
+        ("t,v\n0,1\n1,nan\n2,1\n", "1"),
+        ("t,v\n0,1\n2,1\n1,1\n", "increas"),
+    ],
+)
+def test_ride_refuses_a_bad_waveform(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, told: str
+) -> None:
+    """The texts themselves belong to Waveform and are tested there; here: one message, code 2, nothing
+    written."""
+    (tmp_path / "w.csv").write_text(table)
+    assert run("ride", "gfl", "--waveform", str(tmp_path / "w.csv"), "--out", str(tmp_path / "ride")) == 2
+    said = capsys.readouterr()
+    assert str(tmp_path / "w.csv") in said.err
+    assert told in said.err
+    assert "Traceback" not in said.err
+    assert said.out == ""
+    assert not (tmp_path / "ride").exists()
+
+
+def test_ride_refuses_an_unknown_waveform_and_a_rating_out_of_bounds(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run("ride", "gfl", "--waveform", "sag-71") == 2
+    assert capsys.readouterr().err == (
+        "waveform 'sag-71': no such file and no such test waveform. Did you mean 'sag-70'? "
+        "Known: ercot-style, sag-30, sag-50, sag-70, sag-85.\n"
+    )
+    assert run("ride", "gfl", "--waveform", "sag-70", "--beta", "9") == 2
+    assert capsys.readouterr().err == "beta = 9 1 is outside [0.8, 2].\n"
+
+
+def test_doctor_names_versions_compiler_and_caches(capsys: pytest.CaptureFixture[str]) -> None:
+    code = run("doctor")
+    said = capsys.readouterr().out
+    assert code == 0
+    assert f"dcvrt        {__version__}" in said
+    for word in ("andes", "casadi", "highspy", "compiler", "cache"):
+        assert word in said
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(InputError("a"), 2), (InfeasibleError("b"), 3), (SimulationError("c"), 4)]
+)
+def test_each_kind_of_error_has_its_exit_code(
+    error: Exception, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dcvrt import facility
+
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(facility, "names", fail)
+    assert run("facility", "list") == code
+    assert capsys.readouterr().err == f"{error}\n"
