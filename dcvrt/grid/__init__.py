@@ -4,5 +4,6 @@ from dcvrt.grid.faults import BusFault
 from dcvrt.grid.grid import FaultRun, Grid
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
+from dcvrt.grid.screening import FaultScreen, screen_faults
 
-__all__ = ["BusFault", "FaultRun", "Grid", "Network", "Period"]
+__all__ = ["BusFault", "FaultRun", "FaultScreen", "Grid", "Network", "Period", "screen_faults"]
