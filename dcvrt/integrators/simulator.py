@@ -14,6 +14,7 @@ from dcvrt.errors import InputError, SimulationError
 from dcvrt.integrators.batch import BatchResult, run_batch
 from dcvrt.integrators.casadi import Casadi
 from dcvrt.integrators.channels import Channels, Inputs, channels
+from dcvrt.integrators.corners import outputs_with_corners
 from dcvrt.integrators.equations import Equations
 from dcvrt.integrators.equilibrium import equilibrium, given_start
 from dcvrt.integrators.model import Model
@@ -159,12 +160,9 @@ class Simulator:
         eq, dae = model.equations, self.dae
         t, X, Z, y = [], [], [], []
         for phase in run.phases:
-            times, states, algebraics = (np.concatenate(part) for part in (phase.t, phase.X, phase.Z))
-            C = run.inputs.C[np.concatenate(phase.piece)]
-            t.append(times)
-            X.append(states)
-            Z.append(algebraics)
-            y.append(model.on("outputs", times, states, algebraics, phase.P, C))
+            parts = outputs_with_corners(run, phase)
+            for store, part in zip((t, X, Z, y), parts, strict=True):
+                store.append(part)
         all_x, all_z = np.concatenate(X), np.concatenate(Z)
         outputs = [np.concatenate(part) for part in zip(*y, strict=True)]
         sens = rate_sens = x_sens = z_sens = None

@@ -54,8 +54,7 @@ class Findings:
         if missing:
             raise InputError(
                 f"{self.folder}: {' and '.join(missing)} not found, so this is not the folder of a study "
-                "that "
-                "has ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes."
+                "that has ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes."
             )
 
     # -- what the folder holds -----------------------------------------------------------------------------
@@ -240,10 +239,9 @@ class Findings:
                 for low, high in itertools.pairwise(rows):
                     if high["total_mw"] < low["total_mw"] - self.tolerance_mw:
                         said.append(
-                            f"{mode_name(mode)}, method {method}: capacity falls from {low['total_mw']:.1f} "
-                            "MW at "
-                            f"β = {low['beta']:g} to {high['total_mw']:.1f} MW at β = {high['beta']:g}. "
-                            f"What holds it back there: {self.limits_of(high)}"
+                            f"{mode_name(mode)}, method {method}: capacity falls from "
+                            f"{low['total_mw']:.1f} MW at β = {low['beta']:g} to {high['total_mw']:.1f} MW "
+                            f"at β = {high['beta']:g}. What holds it back there: {self.limits_of(high)}"
                         )
         return said
 
@@ -257,9 +255,8 @@ class Findings:
                     top = rows[-1]
                     said.append(
                         f"{mode_name(mode)}, method {method}: at the highest β studied ({top['beta']:g}) "
-                        f"{top['total_mw']:.1f} MW can be hosted, {self.no_vrt_mw - top['total_mw']:.1f} MW "
-                        "less than "
-                        f"without ride-through ({self.no_vrt_mw:.1f} MW). What prevents more: "
+                        f"{top['total_mw']:.1f} MW can be hosted, {self.no_vrt_mw - top['total_mw']:.1f} "
+                        f"MW less than without ride-through ({self.no_vrt_mw:.1f} MW). What prevents more: "
                         f"{self.limits_of(top)}"
                     )
         return said
@@ -383,7 +380,8 @@ def binding_text(entry: Row) -> str:
     >>> binding_text({"kind": "row", "label": "loss at bus 75", "hour": None, "price": 3.0, "unit": "MW"})
     'loss at bus 75 (3 MW)'
     """
-    text = str(entry["label"]) if entry["kind"] == "row" else f"{entry['kind']} {entry['label']}"
+    bare = entry["kind"] in ("row", "bound")
+    text = str(entry["label"]) if bare else f"{entry['kind']} {entry['label']}"
     if entry.get("hour") is not None:
         text += f" in hour {entry['hour']}"
     price = entry.get("price")

@@ -45,7 +45,8 @@ def draw(signals: Signals, modes: Sequence[str], title: str, v_it_min: float | N
         )
     volts.set_ylabel("voltage (pu)")
     volts.set_ylim(bottom=0.0)
-    panel(volts, next(name), "voltages")
+    least = float(np.min(signals["v_it"]))
+    panel(volts, next(name), f"voltages; the protected IT voltage is at least {round(least, 2) + 0.0:.2f} pu")
 
     for key, label, colour, line in (
         ("p_g", "import at the POI", INK, "-"),

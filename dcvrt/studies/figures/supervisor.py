@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _BOX = (1.25, 0.62)
 _HEIGHT = 3.1
 _KEY = (
-    "Numbers: order in which transitions are tried.  'for': the guard must hold that long without a break.  "
-    "Bold frame: start.  $v_f$: measured POI voltage.  $w$: DC energy over nominal."
+    "Numbers: order in which transitions are tried. 'for': the guard must hold that long without a break.\n"
+    "Bold frame: start. $v_f$: measured POI voltage. $w$: DC energy over nominal."
 )
 
 
@@ -33,7 +33,7 @@ def draw(dae: Dae, automaton: str | None = None) -> Figure:
     """
     table = next(a for a in dae.automata if automaton in (None, a.path))
     values = _values(dae, table)
-    figure = new_figure(PAGE, _HEIGHT + 0.22 + 0.15 * math.ceil(len(values) / 6), arranged=False)
+    figure = new_figure(PAGE, _HEIGHT + 0.36 + 0.15 * math.ceil(len(values) / 6), arranged=False)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     bottom = -(figure.get_figheight() - _HEIGHT)
     axes.set(xlim=(0, PAGE), ylim=(bottom, _HEIGHT))
@@ -57,7 +57,7 @@ def draw(dae: Dae, automaton: str | None = None) -> Figure:
             fontsize=6.8,
             color=INK,
         )
-    axes.text(PAGE / 2, bottom + 0.10, _KEY, ha="center", va="center", fontsize=6.5, color=GREY)
+    axes.text(PAGE / 2, bottom + 0.15, _KEY, ha="center", va="center", fontsize=6.5, color=GREY)
     return figure
 
 

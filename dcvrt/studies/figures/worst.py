@@ -89,7 +89,7 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
         linestyle=(0, (1, 1.5)),
         label="required of the IT voltage",
     )
-    inside.set_ylabel("(pu)")
+    inside.set_ylabel("voltage, energy (pu)")
     panel(
         inside,
         next(name),

@@ -11,7 +11,7 @@ from string import Template
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
-from dcvrt.studies.report import answer, checks, grid, models, plans, record
+from dcvrt.studies.report import answer, checks, grid, hypotheses, models, plans, record
 from dcvrt.studies.report.page import Safe, escape
 
 REPORT = "report.html"
@@ -21,6 +21,7 @@ SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     plans.plans,
     plans.failures,
     plans.closed_sites,
+    hypotheses.hypotheses,
     checks.validation,
     checks.worst_cases,
     grid.grid,
@@ -78,7 +79,6 @@ def text_of(findings: Findings) -> str:
         body=body,
         footer=escape(
             f"Made by dcvrt {versions['dcvrt']} from the store of the study. Screening results in positive "
-            "sequence; "
-            "not a submission to a system operator."
+            "sequence; not a submission to a system operator."
         ),
     )

@@ -28,8 +28,7 @@ def headline(findings: Findings) -> str:
     if best is None or best["total_mw"] <= 0:
         return (
             "No data-centre load can be hosted at the sites studied with any mode and rating studied, if "
-            "every site must "
-            f"ride through every fault. Without ride-through it would be {limit:.1f} MW."
+            f"every site must ride through every fault. Without ride-through it would be {limit:.1f} MW."
         )
     places = ", ".join(
         f"{mw:.1f} MW at bus {site}"
@@ -46,11 +45,9 @@ def headline(findings: Findings) -> str:
     )
     share = 100.0 * best["total_mw"] / limit if limit > 0 else 100.0
     return (
-        f"{best['total_mw']:.1f} MW of data-centre load can be hosted with ride-through: {places}. It takes "
-        f"{takes} (the least "
-        f"rating studied that passed). That is {share:.0f} % of the {limit:.1f} MW that the grid could host "
-        "if no site had to "
-        "ride through faults."
+        f"{best['total_mw']:.1f} MW of data-centre load can be hosted with ride-through: {places}. It "
+        f"takes {takes} (the least rating studied that passed). That is {share:.0f} % of the {limit:.1f} "
+        "MW that the grid could host if no site had to ride through faults."
     )
 
 
@@ -65,8 +62,8 @@ def _cards(findings: Findings) -> Safe:
             cards.append(
                 (
                     f"{best['total_mw']:.1f} MW",
-                    f"{mode_name(mode)}: most that passed the replay, at β = {best['beta']:g} "
-                    f"(method {best['method']})",
+                    f"{mode_name(mode)}: most that passed the replay, at β = {best['beta']:g} (method "
+                    f"{best['method']})",
                 )
             )
     failed = sum(verdict(row) == "failed" for row in findings.rows())
@@ -108,8 +105,8 @@ def _warnings(findings: Findings) -> Safe:
                 "Some simulations have no result",
                 paragraph(
                     f"{counts['failed']} simulation(s) failed and {counts['quarantined']} task(s) were set "
-                    "aside. They are left out of the fits "
-                    "and count as failures in a replay. The section on simulations lists them."
+                    "aside. They are left out of the fits and count as failures in a replay. Where no fit "
+                    "remains, the site is closed. The section on simulations lists them with the reason."
                 ),
             )
         )

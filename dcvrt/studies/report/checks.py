@@ -41,33 +41,32 @@ def validation(findings: Findings) -> Safe:
         "mode",
         "margin",
         "unit",
-        "mean absolute error",
-        "root mean square error",
-        "worst overprediction",
-        "worst underprediction",
+        "MAE",
+        "RMSE",
+        "worst over-prediction",
+        "worst under-prediction",
         "false passes",
-        "conservative violations (%)",
+        "violations (%)",
         "points fitted",
         "validation points",
         "failed runs left out",
-        "fits over mixed event sequences",
+        "fits of mixed sequences",
     ]
     return section(
         "How good the fitted margins are",
         paragraph(
-            "Each margin is fitted on some of the samples, lowered by its largest overprediction there, and "
-            "judged on samples that the "
-            "fit has not seen. A conservative violation is a prediction above the simulated margin; a false "
-            "pass is one that also "
-            "passes a point that truly fails. Errors of the two methods have different units."
+            "Each margin is fitted on some of the samples, lowered by its largest overprediction there, "
+            "and judged on samples that the fit has not seen. A conservative violation is a prediction "
+            "above the simulated margin; a false pass is one that also passes a point that truly fails. "
+            "MAE is the mean absolute error, RMSE the root mean square error; those of the two methods "
+            "have different units."
         ),
         table("Validation of the surrogates after tightening", head, rows, words=[1, 2, 3], marked=marked),
         figure(
             findings.folder / "figures" / "validation.svg",
             alt=_validation_alt(findings, false),
             caption="Simulated against predicted margins after tightening. Points above the line are "
-            "overpredictions; the shaded "
-            "quadrant holds false passes, ringed in red.",
+            "overpredictions; the shaded quadrant holds false passes, ringed in red.",
         ),
     )
 
@@ -92,10 +91,9 @@ def worst_cases(findings: Findings) -> Safe:
         path = case.sequence.replace(">", " → ") or "not recorded"
         text = (
             f"{mode_name(mode)}, β = {case.beta:g}, {case.h_mw:.1f} MW at bus {case.site}; fault "
-            f"{case.fault}, period {case.period}. "
-            f"Voltage margin {number(case.v_margin_pu, 4)} pu, loss margin "
-            f"{number(100 * case.loss_margin_share, 2)} % of the import "
-            f"before the fault: {'passed' if passed else 'FAILED'}. Modes passed through: {path}."
+            f"{case.fault}, period {case.period}. Voltage margin {number(case.v_margin_pu, 4)} pu, loss "
+            f"margin {number(100 * case.loss_margin_share, 2)} % of the import before the fault: "
+            f"{'passed' if passed else 'FAILED'}. Modes passed through: {path}."
         )
         parts.append(figure(picture, alt=f"Waveforms of the worst replayed run. {text}", caption=text))
     return section("The worst replayed cases", *parts)

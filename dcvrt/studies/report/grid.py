@@ -48,9 +48,8 @@ def grid(findings: Findings) -> Safe:
     parts = [
         paragraph(
             f"Network: {findings.study.grid.case}. Candidate sites: bus "
-            f"{', '.join(map(str, findings.sites))}. Faults are "
-            "three-phase, at buses without a data centre, and clear by themselves; simulated with "
-            f"{findings.study.grid.engine}."
+            f"{', '.join(map(str, findings.sites))}. Faults are three-phase, at buses without a data "
+            f"centre, and clear by themselves; simulated with {findings.study.grid.engine}."
         )
     ]
     picture = findings.folder / "figures" / "network_map.svg"
@@ -60,9 +59,8 @@ def grid(findings: Findings) -> Safe:
                 picture,
                 alt="One-line map of the network. " + _map_text(findings),
                 caption=(
-                    "The network. The layout follows the lines, not geography. The area of a site's square "
-                    "grows with its capacity in the plan "
-                    "without ride-through."
+                    "The network. The layout follows the lines, not geography. The area of a site's "
+                    "square grows with its capacity in the plan without ride-through."
                 ),
             )
         )
@@ -70,8 +68,8 @@ def grid(findings: Findings) -> Safe:
         parts.append(paragraph(f"The map of the network is not drawn: {findings.map_problem}"))
     parts += [
         table(
-            "Faults, and the lowest voltage that they leave at each site (pu, over all hosting vectors and "
-            "periods)",
+            "Faults, and the lowest voltage that they leave at each site (pu, over all hosting vectors "
+            "and periods)",
             [
                 "fault",
                 "cleared after (ms)",
@@ -87,10 +85,9 @@ def grid(findings: Findings) -> Safe:
             alt="Lowest voltage during each fault at each site; the numbers stand in the table above.",
             caption=(
                 "Lowest POI voltage by fault and site: the marker is the middle, the bar the range over "
-                "hosting vectors and periods. The "
-                "dashed lines are (1 − allowed loss share) / β: a site left of the line of its rating loses "
-                "more than is allowed, by the "
-                "static law of a current-limited converter at full load."
+                "hosting vectors and periods. The dashed lines are (1 − allowed loss share) / β: a site "
+                "left of the line of its rating loses more than is allowed, by the static law of a "
+                "current-limited converter at full load."
             ),
         ),
         table(

@@ -14,8 +14,8 @@ def facility(findings: Findings) -> Safe:
     for mode in findings.modes:
         text = (
             f"Response of the {mode_name(mode)} facility to the ERCOT-style test waveform: ramp, shallow "
-            "fault, deep fault and high voltage. "
-            "The waveform is our own composition and not ERCOT's official one."
+            "fault, deep fault and high voltage. The waveform is our own composition and not ERCOT's "
+            "official one."
         )
         parts.append(
             figure(findings.folder / "figures" / f"internal_response_{mode}.svg", alt=text, caption=text)
@@ -49,8 +49,7 @@ def assumptions(findings: Findings) -> Safe:
             (
                 "Loss criterion",
                 f"At most {100 * c.loss_share:g} % of the import before the fault may be lost for "
-                f"{c.loss_window_ms:g} ms. "
-                "Illustrative.",
+                f"{c.loss_window_ms:g} ms. Illustrative.",
             ),
             ("Power factor", f"{h.pf:g} for every data centre. Illustrative."),
             ("Branch ratings", f"{h.rating_scale:g} times those of the case. The factor is illustrative."),
@@ -59,9 +58,8 @@ def assumptions(findings: Findings) -> Safe:
             ("Phases", "Positive sequence only. A compliance verdict on the worst phase can differ."),
             (
                 "Waveforms",
-                "The facility is driven by the grid's waveform with its load as the grid model has it; its "
-                "own reaction does not act "
-                "back on the grid.",
+                "The facility is driven by the grid's waveform with its load as the grid model has it; "
+                "its own reaction does not act back on the grid.",
             ),
             (
                 "Nature of the result",

@@ -8,6 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 
+SHORT = 22
+"""Cells of at most so many characters stay on one line."""
+
+
 class Safe(str):
     """Text that is already HTML; everything else is escaped where it enters the page."""
 
@@ -96,7 +100,10 @@ def table(
     for n, row in enumerate(rows):
         first, *rest = zip(kinds, row, strict=True)
         cells = f'<th scope="row" class="{first[0]}">{escape(first[1])}</th>'
-        cells += "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in rest)
+        cells += "".join(
+            f'<td class="{kind}{" short" if len(str(cell)) <= SHORT else ""}">{escape(cell)}</td>'
+            for kind, cell in rest
+        )
         lines.append(f'<tr class="marked">{cells}</tr>' if n in marked else f"<tr>{cells}</tr>")
     return Safe(
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'

@@ -103,8 +103,7 @@ def plans(findings: Findings) -> Safe:
             alt=_capacity_alt(findings),
             caption=(
                 "Hosted capacity against the converter rating β. A red cross is a plan that failed the "
-                "replay. The dashed grey line is "
-                "the capacity without ride-through."
+                "replay. The dashed grey line is the capacity without ride-through."
             ),
         ),
         figure(
@@ -129,23 +128,28 @@ def plans(findings: Findings) -> Safe:
         ),
         paragraph(
             "The replay simulates every fault in every period with every facility of the plan. A negative "
-            "margin is a failure. The "
-            "aggregate loss is the largest sum of the sites' lost import in one fault. The AC power flow "
-            "covers every hour; the "
-            "error is that of the linear voltage screen near a limit."
+            "margin is a failure. The aggregate loss is the largest sum of the sites' lost import in one "
+            "fault. The AC power flow covers every hour; the error is that of the linear voltage screen "
+            "near a limit."
         ),
         table("Checks of each plan", check_head, checks, words=[2, 3, 7], marked=marked),
     )
 
 
-def _what_binds(row: Row) -> str:
-    found = [carried(row)] if carried(row) else []
-    found += [binding_text(entry) for entry in binding(row)[:3]]
+def _what_binds(row: Row) -> Safe:
+    """Closed sites and the dearest limits, one a line; the row says mode and rating already."""
     shut = closed(row)
-    if shut:
-        found.append(f"closed: bus {', '.join(shut)}")
-    more = len(binding(row)) - 3
-    return "; ".join(found) + (f"; {more} more" if more > 0 else "") or "nothing"
+    found = [carried(row)] if carried(row) else []
+    found += [f"closed: bus {', '.join(shut)}"] if shut else []
+    found += [binding_text(entry).replace(_place_in_sweep(row), "") for entry in binding(row)[:2]]
+    more = len(binding(row)) - 2
+    found += [f"{more} more"] if more > 0 else []
+    return Safe("<br>".join(escape(line) for line in found or ["nothing"]))
+
+
+def _place_in_sweep(row: Row) -> str:
+    """How the labels of fitted rows end."""
+    return f", {row['mode']}, beta {row['beta']:g}"
 
 
 def _ac_of_no_vrt(findings: Findings) -> list[object]:
@@ -157,10 +161,11 @@ def _ac_of_no_vrt(findings: Findings) -> list[object]:
     ]
 
 
-def limits_of_no_vrt(findings: Findings) -> str:
+def limits_of_no_vrt(findings: Findings) -> Safe:
     """What limits the plan without ride-through."""
     plan = findings.plans[findings.plans.method == "none"].iloc[0]
-    return "; ".join(binding_text(entry) for entry in plan.binding[:3]) or "nothing"
+    found = [binding_text(entry) for entry in plan.binding[:2]]
+    return Safe("<br>".join(escape(line) for line in found or ["nothing"]))
 
 
 def _capacity_alt(findings: Findings) -> str:
@@ -255,8 +260,8 @@ def closed_sites(findings: Findings) -> Safe:
     return section(
         "Closed sites",
         paragraph(
-            "A site where no capacity in the sampled box passes a margin is closed: it gets no facility, and "
-            "its margins do not hold back the other sites."
+            "A site where no capacity in the sampled box passes a margin is closed: it gets no facility, "
+            "and its margins do not hold back the other sites."
         ),
         table(
             "Closed sites with the margin that closes them",

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
 from dcvrt.studies.style import mode_name
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def simulations(findings: Findings) -> Safe:
@@ -38,28 +43,46 @@ def simulations(findings: Findings) -> Safe:
                 words=[1, 2, 3],
             )
         )
-    failed = findings.margins[findings.margins.failed_in.isin(["grid", "facility"])]
+    failed = failed_runs(findings)
     if len(failed):
-        grouped = failed.groupby(["failed_in", "status"], sort=True).size().reset_index(name="rows")
+        grouped = (
+            failed.groupby(["failed_in", "mode", "beta", "reason"], sort=True).size().reset_index(name="rows")
+        )
         parts.append(
             table(
-                "Failed simulations by reason",
-                ["failed in", "status", "rows"],
-                [[row.failed_in, row.status, str(row.rows)] for row in grouped.itertuples()],
-                words=[1],
+                "Facility runs without a result, by reason",
+                ["failed in", "mode", "β", "reason", "runs"],
+                [
+                    [
+                        row["failed_in"],
+                        mode_name(row["mode"]),
+                        f"{row['beta']:g}",
+                        row["reason"],
+                        str(row["rows"]),
+                    ]
+                    for row in grouped.to_dict("records")
+                ],
+                words=[1, 3],
             )
         )
+        parts.append(paragraph(f"One of them in full: {failed.status.iloc[0]}"))
     battery = findings.margins[(findings.margins.ok == 1)]
     if len(battery):
         visited = int((battery.battery == 1).sum())
         parts.append(
             paragraph(
                 f"In {visited} of {len(battery)} facility runs with a result the supervisor visited "
-                "BATTERY, where the import "
-                "is zero and the load loss 100 %."
+                "BATTERY, where the import is zero and the load loss 100 %."
             )
         )
     return section("Simulations", *parts)
+
+
+def failed_runs(findings: Findings) -> pd.DataFrame:
+    """Rows of margins whose simulation failed, with the first line of what it said as `reason`."""
+    failed = findings.margins[findings.margins.failed_in.isin(["grid", "facility"])]
+    reasons = [str(status).splitlines()[0].split(". ")[0].rstrip(".") for status in failed.status]
+    return failed.assign(reason=reasons)
 
 
 def method(findings: Findings) -> Safe:
@@ -70,12 +93,12 @@ def method(findings: Findings) -> Safe:
             findings.folder / "figures" / "framework.svg",
             alt=(
                 "Hosting proposals go through fault simulation, POI waveforms and the facility model to "
-                "margins; margins become tightened affine rows "
-                "of the hosting programme; every plan is replayed through the whole chain."
+                "margins; margins become tightened affine rows of the hosting programme; every plan is "
+                "replayed through the whole chain."
             ),
             caption=(
-                "The chain of a study. Only the replay accepts a plan: the fitted margins are a way to find "
-                "it."
+                "The chain of a study. Only the replay accepts a plan: the fitted margins are a way to "
+                "find it."
             ),
         ),
     )
@@ -96,13 +119,13 @@ def provenance(findings: Findings) -> Safe:
         ),
         (
             "Files beside this report",
-            "study.toml, study.sqlite (everything), summary.json, table.csv, validation.csv, figures/ (SVG "
-            "and PNG)",
+            "study.toml, study.sqlite (everything), summary.json, table.csv, validation.csv, figures/ "
+            "(SVG and PNG)",
         ),
         (
             "Again",
-            "the same 'dcvrt study run' on this folder repeats nothing; 'dcvrt study report' writes tables, "
-            "figures and report anew",
+            "the same 'dcvrt study run' on this folder repeats nothing; 'dcvrt study report' writes "
+            "tables, figures and report anew",
         ),
     ]
     text = Safe(
