@@ -136,7 +136,6 @@ def _double_conversion(name: str, doc: str) -> Diagram:
     f.connect(lim.i, lag.ask)
     f.connect(lag.i, poi.i)
     f.connect(poi.p, dc.p_g, bess.p_g)
-    f.connect(poi.q, bus.q_g)
 
     f.connect(dc.w, dc_loop.w, lim.w, bess.w, bus.w, sup.w)
     f.connect(dc.drain, dc_loop.p_ref, bess.drain)

@@ -343,6 +343,16 @@ def test_a_long_shallow_dip_ends_on_battery_and_a_swell_in_mixed():
     assert swell.walk == ["NORMAL", "MIXED", "NORMAL"]
 
 
+@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("swell", [1.1, 1.2, 1.3])
+def test_a_swell_does_not_starve_the_servers(name, swell):
+    """Reactive power that the front end absorbs takes nothing from the active service of the output stage."""
+    voltage, jumps = sag(swell, length=0.5)
+    r = ride(system(name), voltage, jumps, 1.0, step=2e-3, rtol=1e-6)
+    assert r.y["v_it"].min() > 0.98
+    assert r.y["p_it"].min() == pytest.approx(r.y["p_it"][0], rel=1e-3)
+
+
 def test_the_battery_empties_and_the_charge_stays_within_bounds():
     """No grid and a battery of one second: discharge ends near soc_min, and the link goes down with it."""
     s = system("gfl", **{"bess.T_E": 1.0})

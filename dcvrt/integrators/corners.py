@@ -23,7 +23,10 @@ LEVELS = 5
 
 def outputs_with_corners(run: Run, phase: Phase) -> tuple[Array, Array, Array, list[Array]]:
     """Times, states, algebraic variables and outputs of a phase, with samples added at corners."""
-    t, X, Z, piece = (np.concatenate(part) for part in (phase.t, phase.X, phase.Z, phase.piece))
+    t: Array = np.concatenate(phase.t)
+    X: Array = np.concatenate(phase.X)
+    Z: Array = np.concatenate(phase.Z)
+    piece = np.concatenate(phase.piece)
     outputs = run.model.on("outputs", t, X, Z, phase.P, run.inputs.C[piece])
     for _ in range(LEVELS):
         at = corners(t, outputs[0][:, :, 0], outputs[1][:, :, 0])

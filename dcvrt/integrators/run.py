@@ -68,6 +68,7 @@ class Run:
         eq = self.equations
         self.X, self.Z = X, Z
         self.t, self.k = float(inputs.start[0]), 0
+        self.ends = np.append(inputs.start[1:], inputs.start[-1] + inputs.length[-1])
         self.p = p
         self.modes = [a.mode_number(a.start) for a in eq.dae.automata]
         self.entry, self.dentry = np.full(eq.na, self.t), np.zeros((eq.na, eq.nw))
@@ -91,8 +92,7 @@ class Run:
 
     def run(self) -> str:
         """Integrate to the end; the status."""
-        end = float(self.inputs.start[-1] + self.inputs.length[-1])
-        borders = [*self.inputs.start[self.inputs.sections[1:]].tolist(), end]
+        borders = [*self.inputs.start[self.inputs.sections[1:]].tolist(), float(self.ends[-1])]
         try:
             for number, border in enumerate(borders):
                 self.k = int(self.inputs.sections[number])
@@ -110,8 +110,9 @@ class Run:
         """Integrate one stretch and handle the first thing that happens in it."""
         fires, row = self._next_timer()
         limit = min(border, fires)
-        if limit <= self.t:  # held for no longer than the clock can resolve
-            return self._fire(row)
+        if limit - self.t <= LOCATED:
+            self._be_at(limit)
+            return self._fire(row) if fires <= limit else None
         t, X, Z, piece = self._stretch(limit)
         crossing = self._first_crossing(t, X, Z, piece)
         if crossing is None:
@@ -128,6 +129,13 @@ class Run:
         self._cross(brackets, float(t[i + 1]))
         return None
 
+    def _be_at(self, t: float) -> None:
+        """Take a time that differs from the present by round-off for the present."""
+        last = self.phases[-1].t[-1]
+        if last[-1] == self.t:
+            last[-1] = t
+        self.t = t
+
     def _move(self, t: float, X: Array, Z: Array, piece: int) -> None:
         self.t, self.X, self.Z, self.k = float(t), X.copy(), Z.copy(), piece
 
@@ -135,26 +143,25 @@ class Run:
 
     def _stretch(self, limit: float) -> tuple[Array, Array, Array, NDArray[np.int64]]:
         """Integrate from here to `limit` or less: time, states, algebraics and piece of each sample."""
-        start, length = self.inputs.start, self.inputs.length
-        while self.k + 1 < len(start) and start[self.k + 1] <= self.t:
+        start, length, end = self.inputs.start, self.inputs.length, self.ends
+        while self.k + 1 < len(start) and start[self.k + 1] <= self.t + LOCATED:
             self.k += 1
         ahead = self.look_ahead if self.has_guards else LONGEST_LOOK
         stop = min(limit, self.t + ahead)
         last = max(int(np.searchsorted(start, stop, side="left")) - 1, self.k)
         groups = 1 << (min(last - self.k + 1, self.model.solver.groups).bit_length() - 1)
         inner = length[self.k + 1 : self.k + groups - 1]
-        if groups > 1 and len(inner) and inner.max() > 4 * inner.min():
+        uneven = len(inner) > 0 and inner.max() > 4 * inner.min()
+        if uneven or length[self.k : self.k + groups].max() > MAX_POINTS * self.save_at:
             groups = 1
+        stop = min(stop, float(end[self.k + groups - 1]))
+        if groups == 1:
+            stop = min(stop, self.t + MAX_POINTS * self.save_at)
         begin = start[self.k : self.k + groups].copy()
         begin[0] = self.t
-        finish = np.append(
-            begin[1:], min(stop, float(start[self.k + groups - 1] + length[self.k + groups - 1]))
-        )
-        longest = float((finish - begin).max())
-        wanted = min(math.ceil(longest / self.save_at - 1e-6), MAX_POINTS)
-        if longest / self.save_at > MAX_POINTS:
-            finish[-1] = begin[-1] + MAX_POINTS * self.save_at
-        points = next(n for n in POINTS if n >= max(wanted, 1))
+        finish = np.append(begin[1:], stop)
+        wanted = math.ceil(float((finish - begin).max()) / self.save_at - 1e-6)
+        points = next(n for n in POINTS if n >= min(max(wanted, 1), MAX_POINTS))
         return self._integrate(begin, finish, points)
 
     def _integrate(

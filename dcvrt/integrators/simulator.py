@@ -158,11 +158,16 @@ class Simulator:
 
     def _trajectory(self, model: Model, run: Run, status: str, p: Array, name: str) -> Trajectory:
         eq, dae = model.equations, self.dae
-        t, X, Z, y = [], [], [], []
+        t: list[Array] = []
+        X: list[Array] = []
+        Z: list[Array] = []
+        y: list[list[Array]] = []
         for phase in run.phases:
-            parts = outputs_with_corners(run, phase)
-            for store, part in zip((t, X, Z, y), parts, strict=True):
-                store.append(part)
+            times, states, algebraics, signals = outputs_with_corners(run, phase)
+            t.append(times)
+            X.append(states)
+            Z.append(algebraics)
+            y.append(signals)
         all_x, all_z = np.concatenate(X), np.concatenate(Z)
         outputs = [np.concatenate(part) for part in zip(*y, strict=True)]
         sens = rate_sens = x_sens = z_sens = None

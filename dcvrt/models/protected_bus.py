@@ -13,12 +13,15 @@ class ProtectedBus(Block):
 
     .. math::
         T_v \dot V = \min\!\left( V_{set} - k_{line} [1 - V_f]_+,\;
-            \frac{\sqrt{(\beta H)^2 - Q_g^2}\; \mathit{pf}}{P^{out}},\; m_{max} \sqrt{w} \right) - V
+            \frac{\beta H\, \mathit{pf}}{P^{out}},\; m_{max} \sqrt{w} \right) - V
 
-    The three limits are: the set point, which a sag pulls down by k_line; the apparent-power headroom that
-    the output stage shares with the grid side; the voltage that the DC link can modulate.
-    Equilibrium: V = V_set while headroom and DC link suffice.
+    The three limits are: the set point, which a sag pulls down by k_line; the apparent power that the output
+    stage may deliver at the power factor of the load; the voltage that the DC link can modulate.
+    Equilibrium: V = V_set while rating and DC link suffice.
     Differs: the paper names an output stage and gives no equation; this is ours, the same in both modes.
+    Differs: the rating is shared with the grid side, whose reactive exchange yields to active service
+    (eq. ups_current_limit); it therefore takes nothing from the output stage. Subtracted from the rating it
+    would starve the servers in a mild swell, when a grid-forming front end absorbs reactive power.
     """
 
     H = Parameter(1.0, "pu(S)", (1e-6, 1e3), "hosted capacity", "decision of the planner")
@@ -30,21 +33,18 @@ class ProtectedBus(Block):
     T_v = Parameter(5e-3, "s", (5e-4, 0.1), "lag of the output stage", "illustrative: 2-12 ms")
     eps = Parameter(1e-3, "pu(V)", (1e-6, 0.1), "smoothing width", "own choice: numerics")
     eps_s = Parameter(
-        1e-3, "1", (1e-6, 0.1), "smoothing width of the headroom, over H", "own choice: numerics"
+        1e-3, "1", (1e-6, 0.1), "power at which the headroom is cut off, over H", "own choice: numerics"
     )
 
     w = Input("1", "DC energy over its nominal value")
     v_f = Input("pu(V)", "measured POI voltage")
-    q_g = Input("pu(S)", "reactive import of the grid side")
     p_out = Input("pu(S)", "power drawn from the bus")
 
     v = State(1.0, "pu(V)", "voltage of the protected bus")
 
     def equations(self, s: Any) -> Equations:
         wanted = s.V_set - s.k_line * smooth.pos(1 - s.v_f, s.eps)
-        rating, small = s.beta * s.H, s.eps_s * s.H
-        square = smooth.pos(rating * rating - s.q_g * s.q_g, small * small)
-        headroom = smooth.root(square, small) * s.pf / (s.p_out + small)
+        headroom = s.beta * s.H * s.pf / (s.p_out + s.eps_s * s.H)
         modulated = s.m_max * smooth.root(smooth.pos(s.w, s.eps), s.eps)
         target = smooth.minimum(smooth.minimum(wanted, headroom, s.eps), modulated, s.eps)
         return Equations(der=dict(v=(target - s.v) / s.T_v))

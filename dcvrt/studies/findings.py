@@ -203,10 +203,13 @@ class Findings:
         return sorted(chosen, key=lambda row: (row["mode"], row["method"], row["beta"]))
 
     def facility(self, mode: str) -> Dae:
-        """The compiled facility of a mode."""
+        """The compiled facility of a mode, with the parameters that the study sets."""
         from dcvrt import facility
 
-        return facility.get(mode).compile()
+        diagram = facility.get(mode)
+        for path, value in self.parameters(mode).items():
+            diagram.set(path, value, "study file")
+        return diagram.compile()
 
     def parameters(self, mode: str) -> dict[str, float]:
         """Parameters that the study sets for a mode, by path."""

@@ -8,8 +8,11 @@ from math import exp, pi, sin
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dcvrt import facility
+from dcvrt.criteria import Criteria, margins
 from dcvrt.dae import Dae, Row
 from dcvrt.errors import InputError, ModelError, SimulationError
 from dcvrt.integrators import Casadi, Simulator
@@ -377,3 +380,54 @@ def test_plot(tmp_path) -> None:
     run.plot(tmp_path / "ride.png", signals=["v_it"])
     assert (tmp_path / "ride.svg").stat().st_size > 5_000
     assert (tmp_path / "ride.png").read_bytes()[:4] == b"\x89PNG"
+
+
+# -- what lies between samples, and any disturbance ---------------------------------------------------------
+
+
+def test_a_corner_between_samples_is_sampled_anew() -> None:
+    """|x - 0.35137| smoothed over 1e-5: its minimum lies between two samples, where a cubic would miss it."""
+    s = Sketch({"x": 0.0}, {"k": 1.0})
+    corner = ca.sqrt((s.x["x"] - 0.35137) ** 2 + 1e-10)
+    dae = s.dae({"x": s.p["k"]}, {"v_it": corner, "p_g": 1.0 + 0 * s.x["x"]})
+    run = Simulator(dae, wrt=("k",), start="given")(flat())
+    low = margins(run, Criteria(criterion="instantaneous")).voltage
+    assert low.value + 0.9 == pytest.approx(1e-5, abs=1e-5)
+    assert low.time == pytest.approx(0.35137, abs=2e-5)
+    assert len(run.t) < 1300
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 10_000))
+def test_any_disturbance_agrees_with_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mode = MODES[seed % 2]
+    steps: list = [(0.0, 1.0)]
+    t = 0.05
+    for _ in range(rng.integers(1, 4)):
+        steps.append((t, rng.uniform(0, 1.3) * np.exp(0.3j * rng.normal())))
+        t += rng.choice([0.005, 0.02, 0.1, 0.3]) * rng.uniform(0.5, 1.5)
+        if rng.random() < 0.6:
+            steps.append((t, rng.uniform(0.6, 1.05), 1.0))
+            t += rng.uniform(0.05, 0.3)
+    wave = Waveform.segments([*steps, (t, 1.0)], until=t + rng.uniform(0.2, 0.8))
+    values = {
+        "beta": rng.uniform(1.0, 1.5),
+        "H": rng.uniform(0.2, 3.0),
+        "dc.T_hold": rng.choice([0.012, 0.03]),
+    }
+    run = simulator(mode).attempt(wave, **values)
+    reference = simulator(mode, "cvodes", 1e-9).attempt(wave, **values)
+    assert run.status.split(" at ")[0] == reference.status.split(" at ")[0]
+    assert run.sequence == reference.sequence
+    assert len(run.breaks) == len(run.break_grad)
+    assert np.unique(run.t, return_counts=True)[1].max() <= 2
+    for event, other in zip(run.events, reference.events, strict=True):
+        assert event.time == pytest.approx(other.time, abs=2e-5)
+    end = min(run.t[-1], reference.t[-1])
+    edges = np.append(run.t[run.breaks], end)
+    times = np.linspace(0.0, end, 600)
+    times = times[np.abs(times[:, None] - edges).min(axis=1) > 2e-3]
+    for name in ("v_it", "p_g", "w_dc"):
+        size = max(1.0, values["H"]) if name == "p_g" else 1.0
+        assert np.abs(run.at(name, times) - reference.at(name, times)).max() < 1e-3 * size

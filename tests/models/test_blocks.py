@@ -473,7 +473,7 @@ def test_cooling_step_is_the_exponential():
 
 def bus_target(**changes):
     bus = ProtectedBus(eps=1e-6, eps_s=1e-6)
-    values = dict(w=1.0, v_f=1.0, q_g=0.2, p_out=0.95, v=0.0) | changes
+    values = dict(w=1.0, v_f=1.0, p_out=0.95, v=0.0) | changes
     return bus, bus.equations(bus.at(**values)).der["v"] * bus.T_v
 
 
@@ -481,9 +481,8 @@ def test_protected_bus_takes_the_least_of_its_three_limits():
     bus, target = bus_target()
     assert target == approx(1.0, abs=1e-5)
     assert bus_target(v_f=0.4)[1] == approx(1 - bus.k_line * 0.6, abs=1e-5)
-    assert bus_target(q_g=0.9)[1] == approx(sqrt(1.15**2 - 0.81) * bus.pf / 0.95, rel=1e-4)
+    assert bus_target(p_out=1.4)[1] == approx(1.15 * bus.pf / 1.4, rel=1e-4)
     assert bus_target(w=0.5)[1] == approx(bus.m_max * sqrt(0.5), rel=1e-4)
-    assert bus_target(q_g=2.0)[1] == approx(0.0, abs=1e-4)
 
 
 # ---- supervisor -----------------------------------------------------------------------------------------

@@ -92,6 +92,18 @@ def test_no_text_is_smaller_than_can_be_read_in_print(folder: Path) -> None:
             assert min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text()) >= 6.0
 
 
+def test_nothing_sticks_out_of_its_figure(folder: Path) -> None:
+    from dcvrt.studies.figures import _figures
+
+    with styled():
+        for name, figure in _figures(Findings(folder)):
+            figure.canvas.draw()  # type: ignore[attr-defined]
+            drawn = figure.get_tightbbox()
+            width, height = figure.get_size_inches()
+            out = (-drawn.x0, -drawn.y0, drawn.x1 - width, drawn.y1 - height)
+            assert max(out) < 0.02, f"{name}: {max(out):.2f} inches beyond the edge"
+
+
 def test_unfinished_study_is_refused_with_the_way_out(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         draw_all(tmp_path)

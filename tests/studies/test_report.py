@@ -12,7 +12,7 @@ import pytest
 
 from dcvrt.studies import outputs
 from dcvrt.studies.findings import Findings, verdict
-from dcvrt.studies.report import write_report
+from dcvrt.studies.report import hypotheses, write_report
 from dcvrt.studies.store import Store
 from tests.studies.synthetic import make
 
@@ -150,6 +150,21 @@ def test_failed_replays_and_lost_simulations_are_in_plain_sight(
 def test_shortfall_is_told_with_its_reason(page: Page) -> None:
     assert "The highest β does not reach the capacity without ride-through" in page.text
     assert "What prevents more: Bus" in page.text
+
+
+def test_findings_of_the_paper_are_tested_on_the_rows(folder: Path, page: Page) -> None:
+    findings = Findings(folder)
+    assert "The paper's findings, tested" in page.text
+    assert hypotheses.full_rating(findings, "gfl", "paper") is None
+    full = [r["beta"] for r in findings.rows("gfl", "share") if r["total_mw"] > findings.no_vrt_mw - 0.3]
+    assert hypotheses.full_rating(findings, "gfl", "share") == min(full)
+    assert hypotheses._forming_needs_less(findings)[0] == hypotheses.HOLDS
+    forming = findings.rows("gfm", "share")
+    forming[-1]["total_mw"] = 100.0
+    outcome, evidence = hypotheses._forming_needs_less(findings)
+    assert outcome == hypotheses.FAILS
+    assert "GFM hosts 100.0 MW, GFL" in evidence
+    assert hypotheses._never_falls(findings)[0] == hypotheses.FAILS
 
 
 def test_clean_study_says_so(tmp_path: Path, folder: Path) -> None:

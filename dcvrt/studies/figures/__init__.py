@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.style import mode_name, save, styled
@@ -81,8 +81,7 @@ def _internal_response(findings: Findings, mode: str) -> Figure:
     waveform = Waveform.ercot_style()
     dae = findings.facility(mode)
     beta = min(findings.study.facility.beta, key=lambda b: abs(b - TEST_BETA))
-    given: dict[str, Any] = findings.parameters(mode)
-    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf, **given)
+    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf)
     title = (
         f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; "
         "not ERCOT's official waveform)"

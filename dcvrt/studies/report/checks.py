@@ -46,7 +46,7 @@ def validation(findings: Findings) -> Safe:
         "worst over-prediction",
         "worst under-prediction",
         "false passes",
-        "violations (%)",
+        "violation rate (%)",
         "points fitted",
         "validation points",
         "failed runs left out",
@@ -56,10 +56,10 @@ def validation(findings: Findings) -> Safe:
         "How good the fitted margins are",
         paragraph(
             "Each margin is fitted on some of the samples, lowered by its largest overprediction there, "
-            "and judged on samples that the fit has not seen. A conservative violation is a prediction "
-            "above the simulated margin; a false pass is one that also passes a point that truly fails. "
-            "MAE is the mean absolute error, RMSE the root mean square error; those of the two methods "
-            "have different units."
+            "and judged on samples that the fit has not seen. A false pass is a point that the fit passes "
+            "and the simulation fails; the conservative-violation rate is their share of all validation "
+            "points. MAE is the mean absolute error, RMSE the root mean square error; those of the two "
+            "methods have different units."
         ),
         table("Validation of the surrogates after tightening", head, rows, words=[1, 2, 3], marked=marked),
         figure(

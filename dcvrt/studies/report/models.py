@@ -28,7 +28,7 @@ def facility(findings: Findings) -> Safe:
             alt=f"Supervisor diagram. Transitions: {rows}.",
             caption=(
                 "Supervisor of the facility, drawn from the transition table that the integrator runs. "
-                "Values are the defaults."
+                "Values are those of the study."
             ),
         )
     )
@@ -101,7 +101,7 @@ def assumptions(findings: Findings) -> Safe:
         table(
             f"Parameters of the {mode_name(mode)} facility",
             ["parameter", "value", "unit", "meaning", "source"],
-            [_parameter(row, findings.parameters(mode)) for row in findings.facility(mode).parameters],
+            [_parameter(row) for row in findings.facility(mode).parameters],
             words=[2, 3, 4],
         )
         for mode in findings.modes
@@ -121,11 +121,8 @@ def assumptions(findings: Findings) -> Safe:
     return section("Assumptions", *parts)
 
 
-def _parameter(row: ParameterRow, given: dict[str, float]) -> list[object]:
-    value, source = (
-        (given[row.path], "study file") if row.path in given else (row.value, row.source or "not stated")
-    )
-    return [row.path, f"{value:g}", row.unit, row.doc, source]
+def _parameter(row: ParameterRow) -> list[object]:
+    return [row.path, f"{row.value:g}", row.unit, row.doc, row.source or "not stated"]
 
 
 def _differing(findings: Findings) -> list[list[object]]:
@@ -134,7 +131,7 @@ def _differing(findings: Findings) -> list[list[object]]:
     shared = [path for path in tables[findings.modes[0]] if all(path in t for t in tables.values())]
     rows: list[list[object]] = []
     for path in shared:
-        values = [findings.parameters(mode).get(path, tables[mode][path].value) for mode in findings.modes]
+        values = [tables[mode][path].value for mode in findings.modes]
         if len(set(values)) > 1:
             why = "; ".join(
                 dict.fromkeys(f"{mode_name(mode)}: {tables[mode][path].source}" for mode in findings.modes)

@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-
 SHORT = 22
 """Cells of at most so many characters stay on one line."""
 
