@@ -13,7 +13,8 @@ from dcvrt import facility
 from dcvrt.errors import InputError
 from dcvrt.grid.network import Network
 from dcvrt.studies.figures import capacity, draw_all, faults, layout, supervisor, validation, worst
-from dcvrt.studies.findings import Findings, by_site, closed, verdict
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.rows import by_site, closed, verdict
 from dcvrt.studies.store import Store
 from dcvrt.studies.style import HATCHES, MARKERS, PALETTE, styled
 from tests.studies.synthetic import LEAST, PERIODS, SITES, make, retained

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from dcvrt.errors import SimulationError
 from dcvrt.studies import outputs
-from dcvrt.studies.findings import Findings, verdict
+from dcvrt.studies.findings import Findings
 from dcvrt.studies.report import hypotheses, write_report
+from dcvrt.studies.rows import verdict
 from dcvrt.studies.store import Store
 from tests.studies.synthetic import make
 
@@ -172,6 +174,22 @@ def test_clean_study_says_so(tmp_path: Path, folder: Path) -> None:
     assert "Every plan that hosts anything passed the replay." in text
     assert "must not be used" not in text
     assert "Some simulations have no result" not in text
+
+
+def test_facility_without_a_response_is_told(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("gfl: no equilibrium at the first value of the waveform.")
+
+    make(tmp_path)
+    shutil.copytree(folder / "figures", tmp_path / "figures")
+    for picture in (tmp_path / "figures").glob("internal_response_*"):
+        picture.unlink()
+    monkeypatch.setattr("dcvrt.integrators.Simulator.attempt", fails)
+    write_report(tmp_path)
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "GFL: no response to the test waveform: gfl: no equilibrium at the first value" in text
 
 
 def test_nothing_hosted_is_an_answer(tmp_path: Path, folder: Path) -> None:

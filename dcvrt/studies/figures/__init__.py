@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.style import mode_name, save, styled
+from dcvrt.studies.style import save, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-TEST_BETA = 1.15
-"""Rating of the facility in the figure of the internal response: the nearest of the study is taken."""
 
 
 def draw_all(folder: Path) -> list[Path]:
@@ -46,7 +43,16 @@ def draw_all(folder: Path) -> list[Path]:
 
 
 def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
-    from dcvrt.studies.figures import capacity, faults, framework, network_map, supervisor, validation, worst
+    from dcvrt.studies.figures import (
+        capacity,
+        faults,
+        framework,
+        internal_response,
+        network_map,
+        supervisor,
+        validation,
+        worst,
+    )
 
     yield "framework", framework.draw()
     yield "capacity", capacity.draw_totals(findings)
@@ -69,26 +75,7 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         if case is not None:
             yield f"worst_case_{mode}", worst.draw(findings, case)
     for mode in findings.modes:
-        yield f"internal_response_{mode}", _internal_response(findings, mode)
+        run, _ = internal_response.on_test_waveform(findings, mode)
+        if run is not None:
+            yield f"internal_response_{mode}", internal_response.draw(findings, mode, run)
     yield "supervisor", supervisor.draw(findings.facility(findings.modes[0]))
-
-
-def _internal_response(findings: Findings, mode: str) -> Figure:
-    from dcvrt.integrators import Simulator
-    from dcvrt.studies.figures import ride
-    from dcvrt.waveform import Waveform
-
-    waveform = Waveform.ercot_style()
-    dae = findings.facility(mode)
-    beta = min(findings.study.facility.beta, key=lambda b: abs(b - TEST_BETA))
-    run = Simulator(dae, save_at=2e-3)(waveform, beta=beta, pf=findings.study.hosting.pf)
-    title = (
-        f"{mode_name(mode)}, β = {beta:g}, on the ERCOT-style test waveform (our own; "
-        "not ERCOT's official waveform)"
-    )
-    return ride.draw(
-        ride.signals_of(run, waveform.at(run.t)),
-        dae.automata[0].modes,
-        title,
-        findings.study.criteria.v_it_min_pu,
-    )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.studies.findings import Findings, Row, by_site, verdict
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.rows import Row, by_site, verdict
 from dcvrt.studies.style import (
     FAILED,
     GREY,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dcvrt.studies.findings import Findings, Row, ac_verdict, by_site, verdict
+from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, bullets, escape, notice, paragraph, section
+from dcvrt.studies.rows import Row, ac_verdict, by_site, verdict
 from dcvrt.studies.style import mode_name
 
 TARGETS = {"voltage": "IT voltage", "loss": "load loss"}

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from dcvrt.studies.findings import Findings, Row, by_site, verdict
+from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.answer import false_passes, name_of
 from dcvrt.studies.report.page import Safe, paragraph, section, table
+from dcvrt.studies.rows import Row, by_site, verdict
 from dcvrt.studies.style import mode_name
 
 HOLDS, FAILS, OPEN = "holds here", "does not hold here", "cannot be tested here"

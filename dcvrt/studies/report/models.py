@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dcvrt.dae import Row as ParameterRow
+from dcvrt.studies.figures.internal_response import on_test_waveform
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
 from dcvrt.studies.style import mode_name
@@ -17,9 +18,12 @@ def facility(findings: Findings) -> Safe:
             "fault, deep fault and high voltage. The waveform is our own composition and not ERCOT's "
             "official one."
         )
-        parts.append(
-            figure(findings.folder / "figures" / f"internal_response_{mode}.svg", alt=text, caption=text)
-        )
+        picture = findings.folder / "figures" / f"internal_response_{mode}.svg"
+        if picture.is_file():
+            parts.append(figure(picture, alt=text, caption=text))
+        else:
+            _, status = on_test_waveform(findings, mode)
+            parts.append(paragraph(f"{mode_name(mode)}: no response to the test waveform: {status}"))
     dae = findings.facility(findings.modes[0])
     rows = "; ".join(row.text for automaton in dae.automata for row in automaton.rows)
     parts.append(

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from dcvrt.studies.findings import (
-    Findings,
-    Row,
-    ac_verdict,
-    binding,
-    binding_text,
-    by_site,
-    carried,
-    closed,
-    verdict,
-)
+from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.answer import name_of
 from dcvrt.studies.report.page import Safe, badge, escape, figure, number, paragraph, section, table
+from dcvrt.studies.rows import Row, ac_verdict, binding, binding_text, by_site, carried, closed, verdict
 from dcvrt.studies.style import mode_name
 
 METHODS = {
