@@ -133,17 +133,10 @@ def _show(result: object) -> None:
     assert isinstance(result, Result)
     frame = result.table()
     sites = [str(column) for column in frame if str(column).startswith("bus_")]
-    shown = Table(
-        "method",
-        "mode",
-        "beta",
-        "MW",
-        *[f"bus {c[4:-3]}" for c in sites],
-        "replay",
-        "voltage margin",
-        "loss margin",
-        "AC",
-    )
+    shown = Table()
+    for heading in ("method", "mode", "beta", "MW", *[f"bus {c[4:-3]}" for c in sites], "replay",
+                    "V margin, pu", "loss margin, MW", "AC"):  # fmt: skip
+        shown.add_column(heading, no_wrap=True)
     for row in records(frame):
         verdict = {"failed": "[red]failed[/]", "passed": "[green]passed[/]"}.get(row["replay"], row["replay"])
         shown.add_row(
@@ -159,7 +152,7 @@ def _show(result: object) -> None:
         )
     console = Console()
     if not sys.stdout.isatty():
-        console.width = 120
+        console.width = 140
     console.print(shown)
     counts = result.summary["simulations"]
     console.print(
@@ -171,9 +164,8 @@ def _show(result: object) -> None:
         for line in result.lost:
             print(line, file=sys.stderr)
         print(
-            "The study is incomplete: plans with missing runs count as failed. Way out: look at the "
-            "messages above, "
-            "then run again with --retry.",
+            "The study is incomplete: plans with missing runs count as failed. Way out: look at the messages "
+            "above, then run again with --retry.",
             file=sys.stderr,
         )
         raise typer.Exit(INCOMPLETE)

@@ -9,7 +9,8 @@ A :class:`Dae` is
 
 with states `x`, algebraic variables `z`, inputs `u`, parameters `p`, the flags `q` of the active modes and
 the clocks `c` (time since each automaton entered its mode). Inside a mode every function is smooth; all
-that is discrete stands in the automata, as data. Models build it, integrators read it; neither knows the other.
+that is discrete stands in the automata, as data. Models build it, integrators read it; neither knows the
+other.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class Transition:
     """Row of an automaton: from `source` to `target` once `guard` has been positive for longer than `held`.
 
     `guard` and `held` are SX expressions of the system's own symbols (`held` of parameters only; 0 fires at
-    once). `reset` maps state positions to expressions of the values before the jump; other states are continuous.
+    once). `reset` maps state positions to expressions of the values before the jump; all other states are
+    continuous.
     """
 
     source: str
@@ -204,7 +206,8 @@ class ParameterTable(tuple[Row, ...]):
     def __str__(self) -> str:
         cells = [("parameter", "value", "unit", "bounds", "meaning", "source")]
         cells += [
-            (r.path, f"{r.value:g}", r.unit, f"[{r.bounds[0]:g}, {r.bounds[1]:g}]", r.doc, r.source) for r in self
+            (r.path, f"{r.value:g}", r.unit, f"[{r.bounds[0]:g}, {r.bounds[1]:g}]", r.doc, r.source)
+            for r in self
         ]
         widths = [max(len(row[k]) for row in cells) for k in range(4)]
         return "\n".join(

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 
 from dcvrt import __version__
 from dcvrt.cli import main
@@ -123,6 +124,30 @@ def test_a_report_needs_a_study_folder(tmp_path: Path, capsys: pytest.CaptureFix
         f"{tmp_path / 'study.sqlite'}: no study store. Way out: name a folder that "
         "'dcvrt study run' has made.\n"
     )
+
+
+def test_a_study_with_a_task_set_aside_is_incomplete(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dcvrt.cli import _show
+    from dcvrt.studies.store import Store
+    from dcvrt.studies.study import Result
+    from tests.studies.synthetic import make
+
+    folder = make(tmp_path / "folder")
+    with Store(folder / "study.sqlite", write=True) as store:
+        store.add_tasks([("ab12" * 16, "samples", "{}")])
+        store.set_task("ab12" * 16, "quarantined", "its worker died 3 times while doing it")
+    with pytest.raises(typer.Exit) as ended:
+        _show(Result.of(folder))
+    assert ended.value.exit_code == 4
+    said = capsys.readouterr()
+    assert said.err == (
+        "samples task ab12ab12ab12: quarantined: its worker died 3 times while doing it\n"
+        "The study is incomplete: plans with missing runs count as failed. Way out: look at the messages "
+        "above, then run again with --retry.\n"
+    )
+    assert "no ride-through" in said.out
 
 
 def test_a_missing_study_file_says_how_to_get_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

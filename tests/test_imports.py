@@ -11,7 +11,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "dcvrt"
 
-# Who may import whom (module or package of dcvrt -> those it may name). The closure of the arrows of the design.
+# Who may import whom: module or package of dcvrt -> those it may name; the closure of the design's arrows.
 BASE = {"errors"}
 MODELS = BASE | {"dae", "units", "models"}
 INTEGRATORS = BASE | {"dae", "waveform", "trajectory", "integrators"}
@@ -76,9 +76,7 @@ def test_heavy_packages_have_one_home(path: Path) -> None:
 
 
 def test_package_import_is_light() -> None:
-    code = (
-        "import sys, dcvrt; "
-        "print([m for m in ('casadi', 'andes', 'highspy', 'pandas', 'matplotlib', 'scipy') if m in sys.modules])"
-    )
+    heavy = ("casadi", "andes", "highspy", "pandas", "matplotlib", "scipy")
+    code = f"import sys, dcvrt; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

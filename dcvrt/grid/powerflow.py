@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -369,7 +369,7 @@ class PowerFlow:
         return result
 
 
-def hosting_directions(network: Network, sites: Integers, pf: float) -> Phasors:
+def hosting_directions(network: Network, sites: Sequence[int] | Integers, pf: float) -> Phasors:
     r"""Change of all scheduled injections per MW hosted at each site, MVA.
 
     The site takes :math:`1 + j\tan\arccos \mathrm{pf}`, and the units share the active part

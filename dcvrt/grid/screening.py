@@ -148,16 +148,14 @@ def screen_faults(
     """Choose bus faults so that the sites are limited by different faults at different rating ratios.
 
     1. A fault at a site, or one that asks more than `beta_max` of any site with nothing hosted, is left out:
-    it would
-       close that site whatever is built.
+       it would close that site whatever is built.
     2. Each remaining fault belongs to the site of which it asks most.
     3. As many targets as sites, evenly spaced over `beta`, from the lowest: among the sites without a
-    limiting fault, take
-       the fault that asks for a rating ratio nearest the target, but not more of an earlier site than that
-       site has.
+       limiting fault, take the fault that asks for a rating ratio nearest the target, but not more of an
+       earlier site than that site has.
     4. Then milder faults up to `count`, in turn from the most limited site on: that which asks for a ratio
-    nearest half
-       way between 1 and the site's own, more than 1, and not more of any site than it has by step 3.
+       nearest half way between 1 and the site's own, more than 1, and not more of any site than it has by
+       step 3.
 
     Ties go to the lower bus number.
 

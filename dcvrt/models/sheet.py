@@ -71,7 +71,13 @@ def ports(block: Block, name: str, feeds: dict[tuple[str, str], str]) -> list[li
 def sheet(diagram: Diagram) -> str:
     """Markdown sheet of a diagram: see :meth:`Diagram.sheet`."""
     from dcvrt.models.diagram import path_of
+    from dcvrt.models.structure import find
     from dcvrt.models.table import shortener
+
+    def output(name: str, end: tuple[str, str]) -> tuple[str, ...]:
+        signal = find(diagram, end)
+        unit, doc = (signal.unit, signal.doc) if signal else ("", "")
+        return "output", f"`{name}`", unit, doc, f"`{path_of(end)}`"
 
     feeds = {target: f"`{path_of(wire.source)}`" for target, wire in diagram.wires.items()}
     parts = [f"# {diagram.name}", diagram.doc]
@@ -88,7 +94,7 @@ def sheet(diagram: Diagram) -> str:
         table(
             ("", "name", "unit", "meaning", "from"),
             [("input", f"`{k}`", d.unit, d.doc, "") for k, (d, _) in diagram.inputs.items()]
-            + [("output", f"`{k}`", "", "", f"`{path_of(end)}`") for k, end in diagram.outputs.items()],
+            + [output(k, end) for k, end in diagram.outputs.items()],
         ),
     ]  # fmt: skip
     for name, block in diagram.blocks.items():

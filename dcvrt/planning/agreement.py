@@ -96,7 +96,7 @@ class Agreement:
             self.guard = np.maximum(GUARD, WIDENING * error)
             if not self.repeat:
                 break  # a sample is enough to tell how wrong it is
-            near = (room < self.guard[:, None]).any(axis=0)
+            near: npt.NDArray[np.bool_] = np.any(room < self.guard[:, None], axis=0)
             near[solved] = False
             hours = np.flatnonzero(near)
         size = abs(v[screen.pq])

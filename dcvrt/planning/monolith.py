@@ -161,13 +161,12 @@ def _head(master: Master) -> tuple[_Head, list[str]]:
     names = [f"H_{bus}" for bus in master.sites]
     requirement = [f"row{r}" for r in range(len(master.rows))]
     if not master.may_close:
-        matrix = sp.csr_matrix(master.coefficients)
         return _Head(
             np.ones(n),
             master.lower,
             master.upper,
             np.zeros(n, bool),
-            matrix,
+            sp.csr_matrix(master.coefficients),
             master.required,
             np.full(len(requirement), np.inf),
             requirement,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -111,7 +112,7 @@ class VoltageScreen:
         if base_violations == "error":
             self._refuse(size, outside)
 
-    def _refuse(self, size: Floats, outside: npt.NDArray[np.bool_]) -> None:
+    def _refuse(self, size: npt.NDArray[np.floating[Any]], outside: npt.NDArray[np.bool_]) -> None:
         """Raise when the base case violates the limits at `pq` buses or at set points."""
         network, (low, high) = self.network, self.limits
         lines = []

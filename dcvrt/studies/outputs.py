@@ -181,7 +181,9 @@ def plan_table(store: Store) -> pd.DataFrame:
 
 
 def verdict_word(plan: Mapping[str, Any]) -> str:
-    """passed, failed, or not replayed."""
+    """passed, failed, not replayed, or nothing hosted."""
+    if plan["total_mw"] == 0:
+        return "nothing hosted"
     if not plan["replayed"]:
         return "not replayed"
     return "passed" if plan["passed"] else "failed"
