@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.errors import InputError, did_you_mean
+from dcvrt.errors import InputError, did_you_mean, outside
 
 Array = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ class Dae:
             row = self.parameter_rows[self.p_names.index(path)]
             low, high = row.bounds
             if not low <= value <= high:
-                problems.append(f"{path} = {value:g} {row.unit} is outside [{low:g}, {high:g}].")
+                problems.append(outside(path, value, row.unit, row.bounds))
                 continue
             values[self.p_names.index(path)] = value
         if problems:

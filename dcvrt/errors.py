@@ -43,6 +43,18 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
     return f"{hint} Known: {listed}."
 
 
+def outside(name: str, value: float, unit: str, bounds: tuple[float, float]) -> str:
+    """Say that a value lies outside the range it may have.
+
+    >>> outside("K_p", -3.0, "rad/s", (1.0, 500.0))
+    'K_p = -3 rad/s is outside [1, 500].'
+    >>> outside("beta", 9.0, "1", (0.8, 2.0))
+    'beta = 9 is outside [0.8, 2].'
+    """
+    measured = f"{value:g}" if unit == "1" else f"{value:g} {unit}"
+    return f"{name} = {measured} is outside [{bounds[0]:g}, {bounds[1]:g}]."
+
+
 def raise_all(problems: list[str], where: str, kind: type[DcvrtError] = InputError) -> None:
     """Raise one error that lists every problem found, or return when there is none.
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 
 import casadi as ca
 
-from dcvrt.errors import InputError, ModelError, did_you_mean, raise_all
+from dcvrt.errors import InputError, ModelError, did_you_mean, outside, raise_all
 from dcvrt.models.automaton import Go
 from dcvrt.models.phasor import Phasor, Scalar
 from dcvrt.units import dimension
@@ -207,7 +207,7 @@ class Block:
             return f"there is no parameter {parameter!r}.{did_you_mean(parameter, known)}"
         low, high = known[parameter].bounds
         if not low <= value <= high:
-            return f"{parameter} = {value:g} {known[parameter].unit} is outside [{low:g}, {high:g}]."
+            return outside(parameter, value, known[parameter].unit, known[parameter].bounds)
         return ""
 
     def __getattr__(self, name: str) -> Any:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import casadi as ca
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, ModelError, did_you_mean
+from dcvrt.errors import InputError, ModelError, did_you_mean, outside
 from dcvrt.models.block import Block, Input, Parameter, Port
 from dcvrt.models.phasor import Scalar
 from dcvrt.units import dimension
@@ -106,7 +106,7 @@ class Diagram:
         if name in self.shared or name in self.blocks or name in self.inputs:
             self.problems.append(f"the name {name!r} of a parameter is taken.")
         if not bounds[0] <= value <= bounds[1]:
-            raise InputError(f"{name} = {value:g} {unit} is outside [{bounds[0]:g}, {bounds[1]:g}].")
+            raise InputError(outside(name, value, unit, bounds))
         self.shared[name] = Shared(ca.SX.sym(name), declared)
         return self.shared[name].symbol
 
@@ -194,7 +194,7 @@ class Diagram:
             declared = self.shared[path].declared
             low, high = declared.bounds
             if not low <= value <= high:
-                raise InputError(f"{path} = {value:g} {declared.unit} is outside [{low:g}, {high:g}].")
+                raise InputError(outside(path, value, declared.unit, declared.bounds))
             declared.value, declared.source = float(value), source
             return
         block_name, _, symbol = path.partition(".")

@@ -374,39 +374,6 @@ def _tightened(
     )
 
 
-# -- summary -------------------------------------------------------------------------------------------------
-
-
-def pooled_scores(fits: Sequence[Surrogate]) -> list[dict[str, float | int | str]]:
-    """Validation figures over all sites and faults, one row per method, mode and target.
-
-    The loss target is in MW for method 'paper' and a share for 'share': errors of the two are not comparable,
-    violation rates are.
-    """
-    rows: list[dict[str, float | int | str]] = []
-    keys = sorted({(f.method, f.mode, f.target) for f in fits})
-    for method, mode, target in keys:
-        members = [f for f in fits if (f.method, f.mode, f.target) == (method, mode, target)]
-        true = np.concatenate([f.validation[1] for f in members])
-        guess = np.concatenate([f.validation[2] for f in members])
-        s = score(guess, true)
-        rows.append(
-            {
-                "method": method,
-                "mode": mode,
-                "target": target,
-                "mae": s.mae,
-                "rmse": s.rmse,
-                "worst_over": s.worst_over,
-                "worst_under": s.worst_under,
-                "violation_rate": s.violation_rate,
-                "n_fit": sum(f.n_fit for f in members),
-                "n_validation": s.n,
-            }
-        )
-    return rows
-
-
 def false_passes(fits: Sequence[Surrogate]) -> int:
     """Validation points that a tightened surrogate passes and the simulation does not."""
     return sum(int(((f.validation[2] >= 0) & (f.validation[1] < 0)).sum()) for f in fits)

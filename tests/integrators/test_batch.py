@@ -90,4 +90,4 @@ def test_unusable_tables(simulator: Simulator, waves: list, table: dict, message
     if message is not None:
         assert str(error.value) == message
     else:
-        assert str(error.value).startswith("batch: 2 problems\n  beta = 9 1 is outside [")
+        assert str(error.value).startswith("batch: 2 problems\n  beta = 9 is outside [")
