@@ -106,6 +106,6 @@ def _fail(equations: Equations, residual: Array) -> None:
     worst = "\n".join(f"  {names[k]} = {residual[k]:.3g}" for k in order[:5])
     raise SimulationError(
         f"{dae.name}: no equilibrium at the first value of the waveform. Largest residuals:\n{worst}\n"
-        "Check that the facility can import its load before the disturbance (beta against 1/(pf V)), "
-        "and the start values."
+        "Check that the facility can import its load before the disturbance (beta V must exceed the load "
+        "factor d), and the start values."
     )

@@ -71,9 +71,8 @@ class Reporter(Silent):
         """Tasks that have ended, all tasks, tasks without a result."""
         now = time.monotonic()
         begin, before = self._begin.setdefault(phase, (now, ended))
-        note = remaining(now - begin, ended - before, total - ended) + (
-            f", {lost} without result" if lost else ""
-        )
+        left = remaining(now - begin, ended - before, total - ended)
+        note = ", ".join(part for part in (left, f"{lost} without result" if lost else "") if part)
         if self._bar is not None:
             if phase not in self._rows:
                 self._rows[phase] = self._bar.add_task(phase, total=total, note="")

@@ -103,8 +103,8 @@ def test_no_equilibrium_names_the_largest_residuals() -> None:
     assert str(error.value) == (
         "sketch: no equilibrium at the first value of the waveform. Largest residuals:\n"
         "  d(w)/dt = -9.81\n  d(h)/dt = 0\n"
-        "Check that the facility can import its load before the disturbance (beta against 1/(pf V)), "
-        "and the start values."
+        "Check that the facility can import its load before the disturbance (beta V must exceed the load "
+        "factor d), and the start values."
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, bullets, escape, notice, paragraph, section
+from dcvrt.studies.report.record import failed_runs
 from dcvrt.studies.rows import Row, ac_verdict, by_site, verdict
 from dcvrt.studies.style import mode_name
 
@@ -104,10 +105,13 @@ def _warnings(findings: Findings) -> Safe:
         boxes.append(
             notice(
                 "Some simulations have no result",
-                paragraph(
-                    f"{counts['failed']} simulation(s) failed and {counts['quarantined']} task(s) were set "
-                    "aside. They are left out of the fits and count as failures in a replay. Where no fit "
-                    "remains, the site is closed. The section on simulations lists them with the reason."
+                Safe(
+                    paragraph(
+                        f"{counts['failed']} simulation(s) failed and {counts['quarantined']} task(s) were "
+                        "set aside. They are left out of the fits and count as failures in a replay. Where "
+                        "no fit remains, the site is closed. The section on simulations lists them all."
+                    )
+                    + bullets(_reasons(findings))
                 ),
             )
         )
@@ -168,3 +172,15 @@ def false_passes(findings: Findings) -> dict[tuple[str, str, str], int]:
         )
         for row in findings.summary["surrogate"]
     }
+
+
+def _reasons(findings: Findings) -> list[str]:
+    """Why simulations failed, the most frequent reason first, with the ratings and periods it came up at."""
+    failed = failed_runs(findings)
+    said = []
+    for reason in failed.reason.value_counts().index[:3]:
+        here = failed[failed.reason == reason]
+        ratings = ", ".join(f"{beta:g}" for beta in sorted(here.beta.unique()))
+        periods = ", ".join(sorted(here.period.unique()))
+        said.append(f"{reason}: {len(here)} run(s), at β = {ratings}, period {periods}.")
+    return said

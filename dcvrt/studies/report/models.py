@@ -58,6 +58,11 @@ def assumptions(findings: Findings) -> Safe:
             ("Power factor", f"{h.pf:g} for every data centre. Illustrative."),
             ("Branch ratings", f"{h.rating_scale:g} times those of the case. The factor is illustrative."),
             ("Normal voltages", f"{h.v_min_pu:g} to {h.v_max_pu:g} pu in every hour."),
+            (
+                "Reactive power",
+                "Generators hold their voltages; their reactive limits are not enforced, neither in the "
+                "power flow of the plans nor in the fault simulation.",
+            ),
             *[(f"Hours: {name}", text) for name, text in findings.provenance.get("sources", {}).items()],
             ("Phases", "Positive sequence only. A compliance verdict on the worst phase can differ."),
             (
