@@ -38,6 +38,8 @@ Segment = tuple[float, complex] | tuple[float, complex, complex]
 TIME_NAMES = ("t", "time", "t_s", "time_s", "seconds")
 MAGNITUDE_NAMES = ("v", "vm", "v_mag", "v_pu", "v_poi", "v_poi_pu", "magnitude", "voltage")
 ANGLE_NAMES = ("angle", "angle_deg", "v_angle", "v_angle_deg", "v_deg")
+HIGHEST = 3.0
+"""Voltage magnitude, pu, above which a waveform is taken to be in volts or kilovolts by mistake."""
 PHASE_NAMES = (("v_a", "v_b", "v_c"), ("va", "vb", "vc"), ("v_l1", "v_l2", "v_l3"), ("l1", "l2", "l3"))
 
 
@@ -137,6 +139,15 @@ def check_samples(t: ArrayLike, v: ArrayLike, what: str) -> list[str]:
     return problems
 
 
+def negative(magnitudes: ArrayLike, what: str) -> list[str]:
+    """Say which magnitude (a voltage given as a real number) is negative: one line, none when none is."""
+    values = np.asarray(magnitudes)
+    if np.iscomplexobj(values) or not (values < 0).any():
+        return []
+    k = int(np.argmax(values < 0))
+    return [f"{what}[{k}] = {values[k]:g} pu is negative. Write a complex value to turn the phasor."]
+
+
 @dataclass(frozen=True, eq=False)
 class Waveform:
     """Positive-sequence POI voltage phasor over time, with its jumps marked.
@@ -172,6 +183,12 @@ class Waveform:
             problems += [
                 p for p in check_samples(self.t, values, f"tangents[{tangent!r}]") if "tangents" in p
             ]
+        if not problems and (high := np.abs(self.v)).max() > HIGHEST:
+            k = int(np.argmax(high))
+            problems.append(
+                f"|v[{k}]| = {high[k]:g} pu at {self.t[k]:g} s is above {HIGHEST:g} pu. "
+                "Divide by the nominal voltage: a waveform is in per unit."
+            )
         raise_all(problems, f"waveform {self.name!r}" if self.name else "waveform")
         set_ = object.__setattr__
         set_(self, "t", _frozen(np.asarray(self.t, dtype=float)))
@@ -221,6 +238,9 @@ class Waveform:
             for k, (a, b) in enumerate(zip(begins, ends, strict=True))
             if not b > a
         ]
+        late += [
+            problem for k, s in enumerate(steps) for problem in negative(np.array(s[1:]), f"segment {k}")
+        ]
         raise_all(late, "waveform")
         t = [x for pair in zip(begins, ends, strict=True) for x in pair]
         v = [x for s in steps for x in (complex(s[1]), complex(s[-1]))]
@@ -239,7 +259,7 @@ class Waveform:
             longer than the waveform ends with it.
         phase_jump : angle of the phasor during the sag, rad.
         """
-        if retained < 0.0 or length <= 0.0:
+        if not retained >= 0.0 or not length > 0.0:
             raise InputError(
                 f"sag: retained = {retained:g} pu must not be negative, length = {length:g} s not zero."
             )
@@ -267,6 +287,7 @@ class Waveform:
         jumps : times at which `v` jumps although no time stands twice there: the sample before holds up to
             the jump, the sample after from it on.
         """
+        raise_all(negative(v, "v"), f"waveform {name!r}")
         t, v = np.asarray(t, dtype=float), np.asarray(v, dtype=complex)
         columns = {k: np.asarray(x, dtype=complex) for k, x in (tangents or {}).items()}
         raise_all(check_samples(t, v, "v"), f"waveform {name!r}")
@@ -343,6 +364,7 @@ class Waveform:
         for channel in filter(None, (magnitude, angle)):
             if channel not in found:
                 raise InputError(f"{path}: no analogue channel {channel!r}.{did_you_mean(channel, found)}")
+        raise_all(negative(found[magnitude], magnitude), str(path))
         turn = np.deg2rad(found[angle]) if angle else 0.0
         v = found[magnitude] / base * np.exp(1j * turn)
         return cls.from_samples(np.asarray(record.time, dtype=float), v, jumps=jumps, name=Path(path).stem)
@@ -510,6 +532,7 @@ def _voltage(table: Mapping[str, Array], phases: str | None, where: str) -> Comp
             return (stacked.min(axis=0) if phases == "minimum" else stacked.mean(axis=0)) + 0j
     for name in MAGNITUDE_NAMES:
         if name in table:
+            raise_all(negative(table[name], name), where)
             angle = next((table[a] for a in ANGLE_NAMES if a in table), None)
             turn = np.zeros(len(table[name])) if angle is None else np.deg2rad(angle)
             return np.asarray(table[name] * np.exp(1j * turn), dtype=complex)

@@ -65,7 +65,7 @@ def test_the_interpolant_is_linear_in_the_samples(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 15))
     t = np.cumsum(rng.uniform(0.01, 0.3, n))
-    v, d = rng.normal(size=(2, n)) + 1j * rng.normal(size=(2, n))
+    v, d = rng.uniform(-1, 1, size=(2, n)) + 1j * rng.uniform(-1, 1, size=(2, n))
     w = Waveform(t, v, {"H": d})
     times = rng.uniform(t[0], t[-1], 30)
     moved = Waveform(t, v + 0.37 * d).at(times)
@@ -263,3 +263,36 @@ def test_unusable_arguments() -> None:
         error_of(lambda: Waveform.sag(0.5, 0.1, 0.1, 1.0).resampled(0.0))
         == "waveform: dt = 0 s must be positive."
     )
+
+
+def test_volts_are_not_taken_for_per_unit() -> None:
+    with pytest.raises(InputError) as error:
+        Waveform.from_samples([0.0, 1.0], [230.0, 231.0], name="site")
+    assert str(error.value) == (
+        "waveform 'site': |v[1]| = 231 pu at 1 s is above 3 pu. "
+        "Divide by the nominal voltage: a waveform is in per unit."
+    )
+
+
+def test_a_magnitude_is_not_negative_but_a_phasor_may_point_anywhere(tmp_path: Path) -> None:
+    sentence = "pu is negative. Write a complex value to turn the phasor."
+    with pytest.raises(InputError) as error:
+        Waveform.from_samples([0.0, 1.0], [1.0, -1.0], name="site")
+    assert str(error.value) == f"waveform 'site': v[1] = -1 {sentence}"
+    with pytest.raises(InputError) as error:
+        Waveform.segments([(0.0, 1.0), (0.5, -0.4)])
+    assert str(error.value) == f"waveform: segment 1[0] = -0.4 {sentence}"
+    table = tmp_path / "w.csv"
+    table.write_text("t,v_pu\n0,1\n1,-0.5\n")
+    with pytest.raises(InputError) as error:
+        Waveform.from_csv(table)
+    assert str(error.value) == f"{table}: waveform table: v_pu[1] = -0.5 {sentence}"
+    assert Waveform.from_samples([0.0, 1.0], [1.0 + 0j, -1.0 + 0j]).at(1.0) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("bad", [dict(retained=-0.1), dict(length=0.0), dict(length=float("nan"))])
+def test_a_sag_has_a_depth_and_a_length(bad: dict[str, float]) -> None:
+    with pytest.raises(
+        InputError, match=r"^sag: retained = .* pu must not be negative, length = .* s not zero\.$"
+    ):
+        Waveform.sag(**(dict(retained=0.5, start=0.1, length=0.1, until=1.0) | bad))

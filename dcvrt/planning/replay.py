@@ -95,7 +95,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         kept = answer.pop("_waveforms", {})
         for mode, beta in runs:
             for fault, site in _worst(answer["rows"], hosting, mode, beta):
-                run = _simulator(mode, _frozen(request["parameters"].get(mode, {})))(
+                run = simulator_of(mode, request["parameters"].get(mode, {}))(
                     kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"])
                 )
                 answer["waveforms"].append(
@@ -146,7 +146,12 @@ def prepare(request: Mapping[str, Any]) -> str:
 
     andes.prepare()
     mode = request["runs"][0][0]
-    return _simulator(mode, _frozen(request["parameters"].get(mode, {}))).backend
+    return simulator_of(mode, request["parameters"].get(mode, {})).backend
+
+
+def simulator_of(mode: str, parameters: Mapping[str, float]) -> Simulator:
+    """The facility of a mode with some parameters set, as this process runs it; compiled once."""
+    return _simulator(mode, _frozen(parameters))
 
 
 # -- the two halves ------------------------------------------------------------------------------------------
@@ -188,7 +193,7 @@ def _facility_rows(
     d: float,
 ) -> list[dict[str, Any]]:
     """One mode at several ratings on the waveforms of one fault."""
-    simulator = _simulator(mode, _frozen(request["parameters"].get(mode, {})))
+    simulator = simulator_of(mode, request["parameters"].get(mode, {}))
     cases = [(site, beta) for site in waveforms for beta in betas]
     result = simulator.batch(
         [waveforms[site] for site, _ in cases],

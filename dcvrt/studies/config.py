@@ -159,6 +159,33 @@ class RunSection(Section):
     )
 
 
+class WhatIfEntry(Section):
+    """`[[what_if]]`: other values of some parameters or criteria, to see how the least rating moves with them."""
+
+    label: str | None = Field(
+        default=None, min_length=1, description="what tables call it; default: the values themselves"
+    )
+    modes: list[str] | None = Field(
+        default=None, min_length=1, description="variants that it is tried on; default: all of the study"
+    )
+    parameters: dict[str, Finite] = Field(default={}, description="facility parameters, by path")
+    v_it_min_pu: Positive | None = Field(default=None, description="in place of that of [criteria]")
+    window_ms: Positive | None = Field(default=None, description="in place of that of [criteria]")
+    loss_share: Share | None = Field(default=None, description="in place of that of [criteria]")
+    loss_window_ms: NotNegative | None = Field(default=None, description="in place of that of [criteria]")
+    voltage_criterion: Literal["sustained", "instantaneous"] | None = Field(
+        default=None, description="in place of that of [criteria]"
+    )
+
+    def criteria(self) -> dict[str, Any]:
+        """The criteria that it changes, under the names of `[criteria]`."""
+        return {
+            name: value
+            for name in CriteriaSection.model_fields
+            if (value := getattr(self, name)) is not None
+        }
+
+
 class StudyFile(BaseModel):
     """A whole study file."""
 
@@ -176,27 +203,36 @@ class StudyFile(BaseModel):
     run: RunSection = RunSection()
     fault: list[FaultEntry] = Field(min_length=1, description="the faults that every site must ride through")
     period: list[PeriodEntry] = Field(min_length=1, description="the hours they are simulated in")
+    what_if: list[WhatIfEntry] = Field(
+        default=[], description="assumptions to vary on the largest plan that passed"
+    )
 
     def canonical(self) -> dict[str, Any]:
-        """Everything that decides a result, as plain data; `[run]` and `[study] name` do not."""
+        """Everything that decides a plan, as plain data.
+
+        `[run]` and `[study] name` do not; `[[what_if]]` is asked of the finished plans, so that a folder may be
+        asked again with other entries.
+        """
         data = self.model_dump(mode="json")
-        del data["run"], data["study"]["name"]
+        del data["run"], data["what_if"], data["study"]["name"]
         return data
 
     def quick(self) -> StudyFile:
-        """The same study with fewer samples, periods and ratings, to see within minutes that all of it works.
+        """The same study with less of everything that takes time, to see within minutes that all of it works.
 
-        Keeps every fault, site and mode. The numbers are coarser, and a folder made this way is not continued
+        Fewer samples, periods, ratings and what-ifs; every fault, site and mode. The numbers are coarser, and a folder made this way is not continued
         by a full run.
         """
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})
+        some = sorted({0, len(self.what_if) // 2, len(self.what_if) - 1}) if self.what_if else []
         ends = self.period if len(self.period) < 3 else [self.period[0], self.period[-1]]
         return self.model_copy(
             update={
                 "sampling": self.sampling.model_copy(update={"n": min(self.sampling.n, 10)}),
                 "facility": self.facility.model_copy(update={"beta": few}),
                 "period": ends,
+                "what_if": [self.what_if[k] for k in some],
             }
         )
 
@@ -341,7 +377,7 @@ def _merged(sentences: list[str]) -> list[str]:
 
 
 def _known_fields(name: str) -> list[str]:
-    entry: Any = {"fault": FaultEntry, "period": PeriodEntry}.get(
+    entry: Any = {"fault": FaultEntry, "period": PeriodEntry, "what_if": WhatIfEntry}.get(
         name, StudyFile.model_fields[name].annotation
     )
     return [field for field in entry.model_fields]

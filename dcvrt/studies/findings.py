@@ -107,6 +107,12 @@ class Findings:
             return store.plans()
 
     @cached_property
+    def what_ifs(self) -> pd.DataFrame:
+        """Least ratings of the largest plans under varied assumptions."""
+        with self._store() as store:
+            return store.what_ifs()
+
+    @cached_property
     def tasks(self) -> pd.DataFrame:
         """Tasks with their states."""
         with self._store() as store:

@@ -36,6 +36,12 @@ binding and
                ac_v_min_pu, ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed,
                worst_voltage_margin_pu, worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss,
                aggregate: where}, n_failed.
+`what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
+               (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name, unit,
+               studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
+               low and high, between which it was searched; rating (NULL when high is not enough). Derived from
+               the waveforms of the replays, written as a whole and emptied when its inputs change:
+               `what_ifs_from` in `provenance` is their digest.
 """
 
 from __future__ import annotations
@@ -56,7 +62,7 @@ from dcvrt.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 1
+VERSION = 2
 """Of the tables below; a store of another version is refused."""
 
 TABLES = {
@@ -94,8 +100,12 @@ TABLES = {
     "INTEGER, "
     "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
     "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
+    "what_ifs": "mode TEXT NOT NULL, number INTEGER NOT NULL, label TEXT NOT NULL, changes TEXT NOT NULL, "
+    "method TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
+    "n_waveforms INTEGER NOT NULL, low REAL NOT NULL, high REAL NOT NULL, rating REAL, "
+    "PRIMARY KEY (mode, number)",
 }
-JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "unknown", "diagnostics", "worst"}
+JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "unknown", "diagnostics", "worst", "changes"}
 
 
 class Store:
@@ -281,6 +291,10 @@ class Store:
     def plans(self) -> pd.DataFrame:
         """Every plan with its power-flow check and its replay."""
         return self._frame("plans", order="method, mode, beta")
+
+    def what_ifs(self) -> pd.DataFrame:
+        """Least ratings under varied assumptions, by mode; number 0 is the study as it is."""
+        return self._frame("what_ifs", order="mode, number")
 
     def waveforms(self, **where: Any) -> list[tuple[dict[str, Any], dict[str, npt.NDArray[np.float32]]]]:
         """Stored waveforms whose columns have the given values, e.g. `waveforms(site=75, mode='gfl')`.

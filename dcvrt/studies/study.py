@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, outputs, phases
+from dcvrt.studies import checks, config, outputs, phases, what_if
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
@@ -79,7 +79,7 @@ class Study:
         out : folder; default "NAME-results" or "NAME-quick" here. A folder of the same study is resumed.
         workers : processes on this machine.
         scheduler : address of a dask scheduler to use instead.
-        quick : fewer samples, periods and ratings, for a look at the whole chain.
+        quick : fewer samples, periods, ratings and what-ifs, for a look at the whole chain.
         retry : do once more what was set aside.
         reporter : shows progress.
 
@@ -123,6 +123,7 @@ class Study:
                     fits = phases.run_fits(store, setting)
                     phases.run_plans(store, setting, fits, reporter)
                     lost += phases.run_replays(campaign, setting)
+                    what_if.run_what_ifs(store, setting, reporter)
                 finally:
                     store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
             outputs.write_results(folder, store)
