@@ -38,6 +38,8 @@ from dcvrt.trajectory import Trajectory
 Array = NDArray[np.float64]
 TIE = 1e-6
 """Minima closer than this, pu, at different places are a tie: the gradient is that of one of them."""
+LIMITED_BEFORE_FAULT = 0.999
+"""Diagnostic `preload` from which on the current limiter counts as active before the fault."""
 
 
 @dataclass(frozen=True)
@@ -135,21 +137,35 @@ class Margins:
         return {**row, **self.diagnostics, "recovered": self.recovered, "sequence": " | ".join(self.sequence)}
 
 
+def only_criteria(criteria: object) -> None:
+    """Refuse what is no :class:`Criteria`.
+
+    Raises
+    ------
+    InputError
+        With the way to make some.
+    """
+    if not isinstance(criteria, Criteria):
+        raise InputError(f"criteria = {criteria!r}: must be criteria. Way out: criteria=Criteria(...).")
+
+
 def margins(run: Trajectory, criteria: Criteria | None = None) -> Margins:
     """Margins and diagnostics of a completed run.
 
     Diagnostics: `v_it_min` (instantaneous), `time_below` (s below the criterion's v_it_min), `loss_share`,
     `loss_pu` (the largest lasting loss), `peak_loss_share` (instantaneous), `recovery_time` (s from the first
     fall below recovery_share to the last return above it; inf if it is still below at the end), `bess_energy`
-    (discharged, pu s) and `peak_loading` (largest i_g/i_max).
+    (discharged, pu s), `peak_loading` (largest i_g/i_max) and `preload` (i_g/i_max before the fault: at 1 the
+    limiter is active from the start, and the import has less reactive power than its power factor says).
 
     Raises
     ------
     InputError
-        the run did not complete, lacks the outputs `v_it` and `p_g`, imports nothing before the fault, or is
-        shorter than the windows.
+        `criteria` that are none; the run did not complete, lacks the outputs `v_it` and `p_g`, imports
+        nothing before the fault, or is shorter than the windows.
     """
-    criteria = criteria or Criteria()
+    criteria = Criteria() if criteria is None else criteria
+    only_criteria(criteria)
     if not run.completed:
         raise InputError(f"margins: the run has no result to judge: {run.status}.")
     voltage = Curve.of(run, "v_it")
@@ -176,7 +192,9 @@ def margins(run: Trajectory, criteria: Criteria | None = None) -> Margins:
     if "p_b" in run.outputs.names:
         diagnostics["bess_energy"] = float(np.trapezoid(np.maximum(run["p_b"], 0.0), run.t))
     if "i_g" in run.outputs.names and "i_max" in run.outputs.names:
-        diagnostics["peak_loading"] = float(np.max(run["i_g"] / run["i_max"]))
+        loading = run["i_g"] / run["i_max"]
+        diagnostics["peak_loading"] = float(np.max(loading))
+        diagnostics["preload"] = float(loading[0])
     return Margins(
         voltage=_margin(run, low, low.value - criteria.v_it_min, low.gradient),
         loss=_margin(run, held, criteria.loss_share - share, -share_theta),

@@ -165,12 +165,6 @@ class Dae:
             raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
         return self.p_names.index(path)
 
-    def output_number(self, path: str) -> int:
-        """Position of the output `path` in `y`."""
-        if path not in self.y_names:
-            raise InputError(f"{self.name} has no output {path!r}.{did_you_mean(path, self.y_names)}")
-        return self.y_names.index(path)
-
     def parameter_values(self, **changes: float) -> Array:
         """Values of `p` with some changed; each change is checked against its bounds.
 

@@ -55,6 +55,16 @@ def outside(name: str, value: float, unit: str, bounds: tuple[float, float]) -> 
     return f"{name} = {measured} is outside [{bounds[0]:g}, {bounds[1]:g}]."
 
 
+def first_sentence(message: str) -> str:
+    """Shorten a message to its first sentence, without the full stop.
+
+    >>> first_sentence("gfl: no equilibrium at 0.5 pu. Largest residuals:\\n  d(x)/dt = 3")
+    'gfl: no equilibrium at 0.5 pu'
+    """
+    lines = message.splitlines()
+    return lines[0].split(". ")[0].rstrip(".") if lines else ""
+
+
 def raise_all(problems: list[str], where: str, kind: type[DcvrtError] = InputError) -> None:
     """Raise one error that lists every problem found, or return when there is none.
 

@@ -184,4 +184,13 @@ class Trajectory:
                 event.target, (event.time, 1.02), xycoords=("data", "axes fraction"), rotation=60, fontsize=6
             )
         axes[-1].set_xlabel("time, s" if self.completed else f"time, s ({self.status})")
-        figure.savefig(path)
+        try:
+            figure.savefig(path)
+        except OSError as error:
+            raise InputError(
+                f"plot: {path} cannot be written: {error.strerror}. Way out: another path."
+            ) from None
+        except ValueError as error:  # a form of file that matplotlib does not know
+            raise InputError(
+                f"plot: {path}: {error}. Way out: a path that ends with .svg, .png or .pdf."
+            ) from None

@@ -16,8 +16,6 @@ ramps are met exactly.
 from __future__ import annotations
 
 import cmath
-import csv
-import io
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,6 +27,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dcvrt.delimited import read_table
 from dcvrt.errors import InputError, did_you_mean, raise_all
 
 Array = NDArray[np.float64]
@@ -323,7 +322,7 @@ class Waveform:
         InputError
             a missing column (with the columns found), a cell that is not a number, unusable samples.
         """
-        table = read_table(Path(path))
+        table = _columns(Path(path))
         where = f"{path}: waveform table"
         t = _column(table, TIME_NAMES, where)
         v = _voltage(table, phases, where)
@@ -462,51 +461,13 @@ def _frozen(values: NDArray[Any]) -> NDArray[Any]:
 # -- tables -----------------------------------------------------------------------------------------------
 
 
-def read_table(path: Path) -> dict[str, Array]:
-    """Read a delimited table with a header into columns; names are lower case without units in brackets."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
-    lines = [
-        (k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")
-    ]
-    if lines and lines[0][1].strip().isdigit():
-        lines = lines[1:]
-    if len(lines) < 2:
-        raise InputError(f"{path}: {len(lines)} line(s); a header and at least two rows are needed.")
-    header = lines[0][1]
-    separator = next((s for s in (";", "\t", ",") if s in header), ",")
-    names = [n.split("[")[0].split("(")[0].strip().strip('"').lower() for n in header.split(separator)]
-    if all(_number(n, separator) is not None for n in names):
-        raise InputError(
-            f"{path}: the first line {header!r} is numbers; name the columns there, for example t,v_re,v_im."
-        )
-    problems, rows = [], []
-    for (line_number, _), cells in zip(
-        lines[1:],
-        csv.reader(io.StringIO("\n".join(x for _, x in lines[1:])), delimiter=separator),
-        strict=True,
-    ):
-        numbers = [_number(cell, separator) for cell in cells]
-        if len(cells) != len(names):
-            problems.append(f"line {line_number} has {len(cells)} cells, the header {len(names)}.")
-        elif None in numbers:
-            k = numbers.index(None)
-            problems.append(f"line {line_number}, column {names[k]!r}: {cells[k]!r} is not a number.")
-        rows.append(numbers)
-    raise_all(problems[:20], str(path))
-    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
-
-
-def _number(cell: str, separator: str) -> float | None:
-    cell = cell.strip()
-    if separator != ",":
-        cell = cell.replace(",", ".")
-    try:
-        return float(cell)
-    except ValueError:
-        return None
+def _columns(path: Path) -> dict[str, Array]:
+    """Columns of a table with a header by name: lower case, without a unit in brackets."""
+    table = read_table(path)
+    if not table.header:
+        raise InputError(f"{path}: the table has no header; name its columns, for example t,v_re,v_im.")
+    names = [name.split("[")[0].split("(")[0].strip().lower() for name in table.header]
+    return dict(zip(names, table.numbers(range(table.width)).T, strict=True))
 
 
 def _column(table: Mapping[str, Array], names: Sequence[str], where: str) -> Array:

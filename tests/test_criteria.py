@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dcvrt import facility
-from dcvrt.criteria import Criteria, Curve, Extremum, margins, sustained_minimum
+from dcvrt.criteria import LIMITED_BEFORE_FAULT, Criteria, Curve, Extremum, margins, sustained_minimum
 from dcvrt.errors import InputError
 from dcvrt.integrators import Casadi, Simulator
 from dcvrt.trajectory import Event, Signals, Trajectory
@@ -311,6 +311,29 @@ def test_diagnostics_in_closed_form() -> None:
     assert m.loss.value == pytest.approx(0.25 - 0.5 * np.exp(-(0.2**2)), abs=1e-6)
     assert m.diagnostics["peak_loss_share"] == pytest.approx(0.5, abs=1e-7)
     assert not m.passed
+
+
+@pytest.mark.parametrize("mode", ["gfl", "gfm"])
+@pytest.mark.parametrize("voltage", [1.0, 0.96])
+def test_preload_tells_a_limiter_that_is_active_before_the_fault(mode: str, voltage: float) -> None:
+    """It is active below beta = d/(pf V_0), and what it cuts first is reactive current."""
+    d, pf = 0.95, 0.98
+    wave = Waveform.segments([(0.0, voltage), (0.1, 0.8), (0.2, voltage)], until=0.4)
+    smooth, _ = simulators(mode)
+    enough = d / (pf * voltage)
+    above = smooth(wave, H=1.0, d=d, pf=pf, beta=1.01 * enough)
+    below = smooth(wave, H=1.0, d=d, pf=pf, beta=0.99 * enough)
+    q_wanted = d * np.tan(np.arccos(pf))
+    assert margins(above).diagnostics["preload"] == pytest.approx(1 / 1.01, abs=1e-4)
+    assert margins(above).diagnostics["preload"] < LIMITED_BEFORE_FAULT
+    assert above["q_g"][0] == pytest.approx(q_wanted, rel=1e-3)
+    assert margins(below).diagnostics["preload"] > LIMITED_BEFORE_FAULT
+    assert below["p_g"][0] == pytest.approx(d, rel=1e-4)
+    current = 0.99 * enough * voltage
+    left = np.sqrt(current**2 - d**2)
+    smoothed = 2e-4  # share by which the smooth limiter stays below the limit
+    assert below["q_g"][0] == pytest.approx(left, abs=smoothed * current**2 / left)
+    assert below["q_g"][0] < 0.75 * q_wanted
 
 
 def test_recovery_may_be_demanded() -> None:

@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "dcvrt"
 
 # Who may import whom: module or package of dcvrt -> those it may name; the closure of the design's arrows.
-BASE = {"errors"}
+BASE = {"cache", "delimited", "errors"}
 MODELS = BASE | {"dae", "units", "models"}
 INTEGRATORS = BASE | {"dae", "waveform", "trajectory", "integrators"}
 CRITERIA = INTEGRATORS | {"criteria"}
@@ -20,8 +20,10 @@ GRID = BASE | {"units", "waveform", "dae", "grid", "integrators", "trajectory"}
 PLANNING = GRID | CRITERIA | MODELS | {"facility", "planning"}
 ALLOWED = {
     "errors": BASE,
+    "cache": BASE,
     "units": BASE,
     "dae": BASE,
+    "delimited": BASE,
     "waveform": BASE,
     "trajectory": BASE | {"dae", "waveform"},
     "models": MODELS,

@@ -176,9 +176,10 @@ def test_three_phases_are_reduced_as_asked(tmp_path: Path) -> None:
             "v_poi_pu, magnitude, voltage (with angle_deg), or v_a, v_b and v_c. Found: t, p.",
         ),
         ("t,v\n0,1\n1,x\n", "line 3, column 'v': 'x' is not a number."),
-        ("t,v\n0,1\n1\n", "line 3 has 1 cells, the header 2."),
-        ("t,v\n", "1 line(s); a header and at least two rows are needed."),
-        ("0,1\n1,1\n", "the first line '0,1' is numbers; name the columns there, for example t,v_re,v_im."),
+        ("t,v\n0,1\n1\n", "line 3 has 1 cells, the table 2."),
+        ("t,v\n", "waveform 'w': 0 sample(s); at least two times are needed."),
+        ("0,1\n1,1\n", "the table has no header; name its columns, for example t,v_re,v_im."),
+        ("t,v\n0,x\n1,1\n2,1\n", "line 2, column 'v': 'x' is not a number."),
         ("t,v\n0,1\n2,1\n1,1\n", "waveform 'w': times do not increase: t[2] = 1 s comes after t[1] = 2 s."),
     ],
 )
@@ -190,7 +191,7 @@ def test_unusable_tables(tmp_path: Path, text: str, message: str) -> None:
 
 def test_missing_file(tmp_path: Path) -> None:
     path = tmp_path / "none.csv"
-    assert error_of(lambda: Waveform.from_csv(path)) == f"{path}: cannot be read: No such file or directory."
+    assert error_of(lambda: Waveform.from_csv(path)) == f"{path}: there is no such file."
 
 
 def test_comtrade_channels_by_name(monkeypatch: pytest.MonkeyPatch) -> None:

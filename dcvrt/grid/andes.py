@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid.dynamics118 import Machine
 from dcvrt.grid.network import Branches, Generators, Network
@@ -29,16 +30,6 @@ Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
 # -- the generated code ------------------------------------------------------------------------------------
-
-
-def cache_folder() -> Path:
-    """Folder for what can be made again: `$DCVRT_CACHE_DIR`, or `dcvrt` in the user's cache folder."""
-    own = os.environ.get("DCVRT_CACHE_DIR")
-    if own:
-        return Path(own)
-    if os.name == "nt":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "dcvrt" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dcvrt"
 
 
 def code_folder() -> Path:

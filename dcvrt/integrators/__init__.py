@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dcvrt.integrators.batch import BatchResult
 from dcvrt.integrators.casadi import Casadi
-from dcvrt.integrators.compiler import NoCompilerWarning, cache_folder, find_compiler
+from dcvrt.integrators.compiler import NoCompilerWarning, find_compiler
 from dcvrt.integrators.simulator import Simulator
 
-__all__ = ["BatchResult", "Casadi", "NoCompilerWarning", "Simulator", "cache_folder", "find_compiler"]
+__all__ = ["BatchResult", "Casadi", "NoCompilerWarning", "Simulator", "find_compiler"]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.criteria import Criteria, Margins, margins
+from dcvrt.criteria import Criteria, Margins, margins, only_criteria
 from dcvrt.errors import InputError, SimulationError, raise_all
 from dcvrt.trajectory import COMPLETED, Trajectory
 from dcvrt.waveform import Waveform
@@ -71,6 +71,8 @@ def run_batch(
     keep: bool,
 ) -> BatchResult:
     """Run every case of the table."""
+    if criteria is not None:
+        only_criteria(criteria)
     cases = _cases(simulator, waveforms, table)
     status: list[str] = []
     found: list[Margins | None] = []
@@ -91,11 +93,28 @@ def run_batch(
     )
 
 
+def only_waveform(waveform: object) -> None:
+    """Refuse what is no waveform.
+
+    Raises
+    ------
+    InputError
+        With the ways to make one.
+    """
+    if not isinstance(waveform, Waveform):
+        raise InputError(
+            f"{waveform!r} is no waveform. Way out: Waveform.sag(...), Waveform.ercot_style(), "
+            "Waveform.from_csv(path) or Waveform(t, v)."
+        )
+
+
 def _cases(
     simulator: Simulator, waveforms: Sequence[Waveform], table: Mapping[str, float | Sequence[float]]
 ) -> list[tuple[Waveform, dict[str, float]]]:
     if isinstance(waveforms, Waveform):
         waveforms = [waveforms]
+    for waveform in waveforms if not isinstance(waveforms, str) else [waveforms]:
+        only_waveform(waveform)
     columns = {
         k: list(v) for k, v in table.items() if not isinstance(v, (int, float)) and hasattr(v, "__len__")
     }

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import casadi as ca
 
+from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError
 
 FLAGS = ("-O2", "-fno-math-errno", "-fPIC", "-shared")
@@ -45,17 +46,6 @@ class Compiler:
 
     def __str__(self) -> str:
         return self.version
-
-
-def cache_folder() -> Path:
-    """Where compiled objects are kept: DCVRT_CACHE_DIR, or the user's cache folder."""
-    if chosen := os.environ.get("DCVRT_CACHE_DIR"):
-        return Path(chosen)
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "dcvrt" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "dcvrt"
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dcvrt"
 
 
 def find_compiler() -> Compiler | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dcvrt.criteria import Criteria
 from dcvrt.dae import Dae
 from dcvrt.errors import InputError, SimulationError
-from dcvrt.integrators.batch import BatchResult, run_batch
+from dcvrt.integrators.batch import BatchResult, only_waveform, run_batch
 from dcvrt.integrators.casadi import Casadi
 from dcvrt.integrators.channels import Channels, Inputs, channels
 from dcvrt.integrators.corners import outputs_with_corners
@@ -45,7 +45,7 @@ class Simulator:
     Raises
     ------
     InputError
-        a `wrt` that stands twice, `save_at` that is not positive, a compiler that fails.
+        what is no solver, a `wrt` that stands twice, `save_at` that is not positive, a compiler that fails.
     """
 
     def __init__(
@@ -61,6 +61,12 @@ class Simulator:
         twice = sorted({n for n in wrt if list(wrt).count(n) > 1})
         if twice:
             raise InputError(f"wrt names {', '.join(twice)} twice.")
+        if solver is not None and not isinstance(solver, Casadi):
+            named = repr(solver) if isinstance(solver, str) else "..."
+            raise InputError(
+                f"solver = {solver!r}: must be solver options. Way out: solver=Casadi({named}), or leave it "
+                "out."
+            )
         if not save_at > 0:
             raise InputError(f"save_at = {save_at:g} s must be positive.")
         if start not in ("equilibrium", "given"):
@@ -89,7 +95,7 @@ class Simulator:
         Raises
         ------
         InputError
-            unknown names, values outside their bounds.
+            what is no waveform, unknown names, values outside their bounds.
         SimulationError
             no equilibrium, or the run ended before its time; the message is the status.
         """
@@ -100,6 +106,7 @@ class Simulator:
 
     def attempt(self, waveform: Waveform, inputs: Inputs | None = None, **parameters: float) -> Trajectory:
         """As a call, but a run that ends before its time is returned, with its status and what there is."""
+        only_waveform(waveform)
         p = self.dae.parameter_values(**parameters)
         model = self._model(any(name in waveform.tangents for name in self.wrt))
         table = self._channels(model.equations, waveform, inputs)
@@ -127,7 +134,7 @@ class Simulator:
         Raises
         ------
         InputError
-            no waveform, columns whose lengths differ, unknown names.
+            no waveform, what is no waveform or no criteria, columns whose lengths differ, unknown names.
         """
         return run_batch(self, waveforms, table, criteria, keep)
 

@@ -17,8 +17,6 @@ measurements where the defaults say so, the rest is illustrative.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dcvrt.delimited import read_table
 from dcvrt.errors import InputError, raise_all
 
 Array = NDArray[np.float64]
@@ -174,8 +173,6 @@ def measured(
         than ten times the usual step, a mean that is not positive, a gain that makes the load negative.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file.")
     if path.suffix.lower() == ".npy":
         data = _from_npy(path)
         t, p = data[:, 0], data[:, 1]
@@ -186,6 +183,8 @@ def measured(
 
 
 def _from_npy(path: Path) -> Array:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file.")
     data = np.load(path, allow_pickle=False)
     if data.ndim != 2 or data.shape[1] != 2:
         raise InputError(
@@ -194,64 +193,23 @@ def _from_npy(path: Path) -> Array:
     return np.asarray(data, dtype=float)
 
 
-def _number(cell: str, decimal_comma: bool) -> float:
-    return float(cell.strip().replace(",", ".") if decimal_comma else cell.strip())
-
-
-def _is_number(cell: str, decimal_comma: bool) -> bool:
-    try:
-        _number(cell, decimal_comma)
-    except ValueError:
-        return False
-    return True
-
-
 def _from_csv(path: Path, time: str | int, power: str | int) -> tuple[Array, Array, NDArray[np.int64]]:
-    text = path.read_text(encoding="utf-8-sig")
-    separator = next((s for s in (";", "\t", ",") if s in text), ",")
-    decimal_comma = separator != "," and "," in text
-    rows = [
-        (k, row)
-        for k, row in enumerate(csv.reader(io.StringIO(text), delimiter=separator), 1)
-        if any(c.strip() for c in row)
-    ]
-    # a count line before the header has fewer cells than the table: it is not a header
-    width = max((len(row) for _, row in rows), default=0)
-    first = next(
-        (
-            n
-            for n, (_, row) in enumerate(rows)
-            if len(row) == width > 1 and _is_number(row[-1], decimal_comma)
-        ),
-        len(rows),
-    )
-    header = [c.strip() for c in rows[first - 1][1]] if first else []
-    if first == len(rows):
-        raise InputError(f"{path}: no line with numbers in two columns or more was found.")
+    table = read_table(path)
     columns = []
     for what in (time, power):
-        if isinstance(what, str):
-            if what not in header:
-                raise InputError(
-                    f"{path}: there is no column {what!r}. The columns are: {', '.join(header) or 'unnamed'}."
-                )
-            columns.append(header.index(what))
-        elif not 0 <= what < width:
-            raise InputError(f"{path}: there is no column {what}; it has {width}, numbered from 0.")
-        else:
+        if isinstance(what, int):
+            if not 0 <= what < table.width:
+                raise InputError(f"{path}: there is no column {what}; it has {table.width}, numbered from 0.")
             columns.append(what)
-    problems, values, lines = [], [], []
-    for line, row in rows[first:]:
-        cells = [row[k] if k < len(row) else "" for k in columns]
-        wrong = [c for c in cells if not _is_number(c, decimal_comma)]
-        if wrong:
-            problems.append(f"line {line}: {wrong[0]!r} is not a number.")
+        elif what not in table.header:
+            raise InputError(
+                f"{path}: there is no column {what!r}. "
+                f"The columns are: {', '.join(table.header) or 'unnamed'}."
+            )
         else:
-            values.append([_number(c, decimal_comma) for c in cells])
-            lines.append(line)
-    raise_all(problems[:10], str(path))
-    data = np.array(values)
-    return data[:, 0], data[:, 1], np.array(lines, dtype=np.int64)
+            columns.append(table.header.index(what))
+    data = table.numbers(columns)
+    return data[:, 0], data[:, 1], table.lines
 
 
 def _normalise(path: Path, t: Array, p: Array, lines: NDArray[np.int64], gain: float) -> tuple[Array, Array]:

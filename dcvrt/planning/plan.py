@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.planning.reactive import ReactiveExcess
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -28,12 +30,15 @@ class Row:
     site : int, optional
         The site whose facility the requirement is about. It holds only while that site is open (H > 0):
         a site without a facility has nothing that could fail. Without it the row always holds.
+    unit : str
+        Unit of `lower`, for reports: "pu", "MW", "share of load"; empty where it has no name.
     """
 
     coefficients: Mapping[int, float]
     lower: float
     label: str
     site: int | None = None
+    unit: str = ""
 
     def value(self, by_site: Mapping[int, float]) -> float:
         """Left-hand side less right-hand side at given capacities: negative when violated."""
@@ -149,7 +154,7 @@ class Plan:
     by_site : dict of bus number to float
         Hosted capacity H, MW.
     binding : tuple of Binding
-        What keeps the total from growing, dearest first.
+        What keeps the total from growing, highest price first.
     closed : dict of bus number to str
         Sites without a facility, each with the reason.
     certificate : Certificate
@@ -191,7 +196,10 @@ class AcVerdict:
     hour, bus : int or None
         Where the voltage is nearest to a limit, or farthest beyond it.
     status : str
-        A sentence.
+        What came out of the voltages, then how far units are beyond their reactive limits.
+    reactive, reactive_unhosted : ReactiveExcess or None
+        Units beyond their reactive limits at the plan, and the same with nothing hosted. The power flow does
+        not enforce these limits, and `passed` says nothing about them. None when no hour has a solution.
     """
 
     passed: bool
@@ -201,3 +209,5 @@ class AcVerdict:
     hour: int | None
     bus: int | None
     status: str
+    reactive: ReactiveExcess | None = None
+    reactive_unhosted: ReactiveExcess | None = None

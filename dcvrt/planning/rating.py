@@ -62,7 +62,9 @@ def least_rating(
         No waveform, load factors that do not match them, limits or a tolerance that leave nothing to search;
         parameters that the facility does not have or that lie outside their bounds.
     """
-    factors = np.broadcast_to(np.asarray(d, dtype=float), len(waveforms)) if np.ndim(d) == 0 else np.asarray(d)
+    factors = (
+        np.broadcast_to(np.asarray(d, dtype=float), len(waveforms)) if np.ndim(d) == 0 else np.asarray(d)
+    )
     if not len(waveforms):
         raise InputError("least rating: there is no waveform to ride through.")
     if len(factors) != len(waveforms):

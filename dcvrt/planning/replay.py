@@ -135,18 +135,29 @@ def fault_label(fault: Mapping[str, Any]) -> str:
 
 def prepare(request: Mapping[str, Any]) -> str:
     """Make what is made once per machine: the grid simulator's code, the compiled facility of the request's
-    first run.
+    first mode; and try the values of its runs.
 
     Returns
     -------
     str
         How the facility is evaluated: the compiler, or the interpreter and why.
+
+    Raises
+    ------
+    InputError
+        When the compiler fails, or a facility does not take a rating, the power factor or the data-centre
+        factor of the request.
     """
     from dcvrt.grid import andes
 
     andes.prepare()
     mode = request["runs"][0][0]
-    return simulator_of(mode, request["parameters"].get(mode, {})).backend
+    simulator = simulator_of(mode, request["parameters"].get(mode, {}))
+    for beta in [beta for m, beta in request["runs"] if m == mode]:
+        simulator.dae.parameter_values(
+            H=1.0, beta=beta, d=request["period"]["dc_factor"], pf=float(request["pf"])
+        )
+    return simulator.backend
 
 
 def simulator_of(mode: str, parameters: Mapping[str, float]) -> Simulator:

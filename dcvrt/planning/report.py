@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Floats = npt.NDArray[np.float64]
 
 NO_PRICE = 1e-7
-"""Price below which a limit is not reported, MW per unit."""
+"""Price below which a limit is not reported, MW per pu, MW, MVA or share of load."""
 CLOSED_MW = 1e-7
 AC_TOLERANCE = 1e-6
 """Violation of a voltage limit that the AC check lets pass, pu."""
@@ -84,7 +84,8 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
             )
     for row, price in zip(master.rows, solution.row_price, strict=True):
         if price > NO_PRICE:
-            add(Binding("row", row.label, float(price), "MW per unit", row.lower, bus=row.site))
+            unit = f"MW per {row.unit or 'unit of the row'}"
+            add(Binding("row", row.label, float(price), unit, row.lower, bus=row.site))
     for bus, limit, price in zip(master.sites, master.upper, solution.bound_price, strict=True):
         if price > NO_PRICE:
             add(Binding("bound", f"largest size of site {bus}", float(price), "MW/MW", float(limit), bus=bus))
@@ -134,10 +135,12 @@ def _closed(
             key=lambda row: row.value(opened),
         )
         if broken:
-            more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+            others = len(broken) - 1
+            more = f", and {others} more margin{'s' * (others > 1)} fall{'s' * (others == 1)} short"
+            short = f"{-broken[0].value(opened):.4g} {broken[0].unit}".rstrip()
             reasons[bus] = (
-                f"{broken[0].label}: {-broken[0].value(opened):.4g} short at {opened[bus]:g} MW "
-                f"beside the other sites{more}"
+                f"{broken[0].label}: {short} short at {opened[bus]:g} MW beside the other sites"
+                f"{more if others else ''}"
             )
         elif master.upper[i] == 0:
             reasons[bus] = "its largest size is 0 MW"
@@ -180,6 +183,12 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
             f"{outside} of {len(problem.year)} hours have a voltage outside its limits; the worst is "
             f"{size[row, k]:.5f} pu at bus {bus} in hour {hour}."
         )
+    reactive, unhosted = problem.ac.reactive_excess(H, solved.v[:, good], good), problem.ac.reactive_unhosted
+    if reactive.units or unhosted.units:
+        status += (
+            f" Units beyond their reactive limits, which are not enforced: {reactive}. With nothing hosted: "
+            f"{unhosted}."
+        )
     return AcVerdict(
         inside and bool(solved.converged.all()),
         float(size.min()),
@@ -188,6 +197,8 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         hour,
         bus,
         status,
+        reactive,
+        unhosted,
     )
 
 

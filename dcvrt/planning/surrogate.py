@@ -18,19 +18,21 @@ Two forms are fitted to the same samples:
 Both are tightened by the largest overprediction on the fitting set (eqs. (surrogate_overprediction),
 (surrogate_tightening)). A run that failed has no margin: it is left out of every fit and counted in
 `n_excluded`. Where no run of a rating and period has a margin, or too few have one for a fit, the surrogate
-says nothing and the site counts as one that does not pass (`Surrogate.unknown`).
+says nothing and the site counts as one that does not pass (`Surrogate.unknown`). A run of the validation set
+that failed where the surrogate does say something has no error either, but counts in the violation rate: as
+a false pass when the surrogate passes it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.errors import InputError, raise_all
+from dcvrt.errors import InputError, first_sentence, raise_all
 
 Floats = npt.NDArray[np.float64]
 Booleans = npt.NDArray[np.bool_]
@@ -76,13 +78,16 @@ class Scores:
 
     Attributes
     ----------
-    n : number of points.
+    n : number of points whose simulation has a margin; errors are taken over these.
+    n_failed : number of further points, whose simulation failed.
     mae, rmse : mean absolute and root-mean-square error.
     worst_over, worst_under : largest amount predicted above and below the true margin; 0 where there is none.
-    violation_rate : share of points predicted to pass (>= 0) that do not (< 0): false passes over all points.
+    violation_rate : false passes over all `n + n_failed` points: predicted to pass (>= 0), and the margin is
+        negative or the simulation failed.
     """
 
     n: int
+    n_failed: int
     mae: float
     rmse: float
     worst_over: float
@@ -90,23 +95,36 @@ class Scores:
     violation_rate: float
 
 
-def score(predicted: npt.ArrayLike, m: npt.ArrayLike) -> Scores:
-    """Compare predictions with true margins.
+def false_passes(predicted: npt.ArrayLike, m: npt.ArrayLike) -> Booleans:
+    """Which points are predicted to pass and do not: their margin is negative, or NaN, as their run failed.
 
-    >>> score([0.1, -0.1], [-0.1, 0.1])
-    Scores(n=2, mae=0.2, rmse=0.2, worst_over=0.2, worst_under=0.2, violation_rate=0.5)
+    >>> false_passes([0.1, 0.1, 0.1, -0.1], [0.2, -0.1, float("nan"), float("nan")]).tolist()
+    [False, True, True, False]
     """
     guess, true = np.asarray(predicted, dtype=float), np.asarray(m, dtype=float)
-    if not len(true):
-        return Scores(0, *[float("nan")] * 5)
-    error = guess - true
+    return np.asarray((guess >= 0.0) & ~(true >= 0.0))
+
+
+def score(predicted: npt.ArrayLike, m: npt.ArrayLike) -> Scores:
+    """Compare predictions with true margins; a margin of NaN stands for a run that failed.
+
+    >>> score([0.1, -0.1], [-0.1, 0.1])
+    Scores(n=2, n_failed=0, mae=0.2, rmse=0.2, worst_over=0.2, worst_under=0.2, violation_rate=0.5)
+    >>> score([0.1, 0.1], [0.1, float("nan")]).violation_rate
+    0.5
+    """
+    guess, true = np.asarray(predicted, dtype=float), np.asarray(m, dtype=float)
+    known = ~np.isnan(true)
+    g, t = guess[known], true[known]
+    nan = float("nan")
     return Scores(
-        n=len(true),
-        mae=float(np.abs(error).mean()),
-        rmse=float(np.sqrt((error**2).mean())),
-        worst_over=overprediction(guess, true),
-        worst_under=overprediction(true, guess),
-        violation_rate=float(((guess >= 0.0) & (true < 0.0)).mean()),
+        n=len(t),
+        n_failed=len(true) - len(t),
+        mae=float(np.abs(g - t).mean()) if len(t) else nan,
+        rmse=float(np.sqrt(((g - t) ** 2).mean())) if len(t) else nan,
+        worst_over=overprediction(g, t) if len(t) else nan,
+        worst_under=overprediction(t, g) if len(t) else nan,
+        violation_rate=float(false_passes(guess, true).mean()) if len(true) else nan,
     )
 
 
@@ -129,6 +147,7 @@ class MarginData:
     voltage : voltage margin, pu.
     loss_share, loss_mw : loss margin as a share of the import before the fault, and in MW.
     ok : False for a run that failed; its margins are not read.
+    status : how the run ended; of a failed run the reason.
     sequence : modes that the supervisor passed through.
     fit : True for a hosting vector of the fitting set.
     name : name of the hosting vector.
@@ -146,6 +165,7 @@ class MarginData:
     loss_share: Floats
     loss_mw: Floats
     ok: Booleans
+    status: npt.NDArray[np.str_]
     sequence: npt.NDArray[np.str_]
     fit: Booleans
     name: npt.NDArray[np.str_]
@@ -185,11 +205,11 @@ class Surrogate:
     slopes : per MW of data-centre load P_j = d_t H_j, in the order of the sites.
     rating_slope : per MVA of the site's own rating, 0 in method 'share'.
     tightening : how much the intercept was lowered.
-    unknown : (beta, period) pairs at which every run of the fitting set failed, or that have no fit.
+    unknown : the reason by (beta, period), where every run of the fitting set failed or too few are left.
     n_fit, n_excluded : points fitted; points of the fitting set left out because their run failed.
     n_mixed, n_sequences : fitting points whose event sequence is not the most common one; how many sequences.
     scores : on the validation set.
-    validation : (names, margins, predictions) of the validation points.
+    validation : (names, margins, predictions) of the validation points; margins of failed runs are NaN.
     """
 
     method: str
@@ -203,7 +223,7 @@ class Surrogate:
     slopes: Floats
     rating_slope: float
     tightening: float
-    unknown: tuple[tuple[float, str], ...]
+    unknown: Mapping[tuple[float, str], str]
     n_fit: int
     n_excluded: int
     n_mixed: int
@@ -295,10 +315,11 @@ def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
     x = np.column_stack([*[(data.period[chosen] == period).astype(float) for period in seen], load])
     m = data.margin(target, "share")[chosen]
     k = _coefficients(x, m, fitted)
+    known = bool(np.isfinite(k).all())
     fits = []
     for period in periods:
         here = data.period[chosen] == period
-        intercept = k[seen.index(period)] if period in seen and np.isfinite(k).all() else -np.inf
+        intercept = k[seen.index(period)] if period in seen and known else -np.inf
         fits.append(
             _tightened(
                 "share",
@@ -308,7 +329,7 @@ def _fit_share(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> 
                 m[here],
                 _predict(x[here], k),
                 intercept,
-                k[len(seen) :],
+                k[len(seen) :] if known else np.zeros(load.shape[1]),
                 0.0,
                 period=period,
                 beta=float(data.beta[chosen[0]]),
@@ -350,7 +371,10 @@ def _tightened(
     sequences = Counter(data.sequence[chosen[fit & ok]].tolist())
     places = list(zip(data.beta[chosen].tolist(), data.period[chosen].tolist(), strict=True))
     good = {place for place, usable in zip(places, fit & ok, strict=True) if usable}
-    unseen = ~fit & ok & known
+    silent = sorted(set(places) - good if known else set(places))
+    spoken = np.array([place not in silent for place in places], dtype=bool)
+    unseen = ~fit & spoken
+    seen = np.where(ok, m, np.nan)[unseen]
     first = chosen[0]
     return Surrogate(
         method=method,
@@ -364,16 +388,27 @@ def _tightened(
         slopes=slopes,
         rating_slope=float(rating_slope),
         tightening=tightening,
-        unknown=tuple(sorted(set(places) - good if known else set(places))),
+        unknown={
+            place: _why_unknown(data.status[at], data.ok[at])
+            for place in silent
+            for at in [chosen[fit & np.array([other == place for other in places])]]
+        },
         n_fit=int((fit & ok).sum()),
         n_excluded=int((fit & ~ok).sum()),
         n_mixed=sum(sequences.values()) - max(sequences.values(), default=0),
         n_sequences=len(sequences),
-        scores=score(predicted[unseen] - tightening, m[unseen]),
-        validation=(data.name[chosen[unseen]], m[unseen], predicted[unseen] - tightening),
+        scores=score(predicted[unseen] - tightening, seen),
+        validation=(data.name[chosen[unseen]], seen, predicted[unseen] - tightening),
     )
 
 
-def false_passes(fits: Sequence[Surrogate]) -> int:
-    """Validation points that a tightened surrogate passes and the simulation does not."""
-    return sum(int(((f.validation[2] >= 0) & (f.validation[1] < 0)).sum()) for f in fits)
+def _why_unknown(status: npt.NDArray[np.str_], ok: Booleans) -> str:
+    """Reason why nothing is known at a rating and period, from its runs in the fitting set."""
+    reasons = Counter(first_sentence(str(text)) for text in status[~ok])
+    if not reasons:
+        return f"{len(ok)} runs in the fitting set are too few for a fit"
+    most = f"{'most often' if len(reasons) > 1 else 'the reason'}: {reasons.most_common(1)[0][0]}"
+    if ok.any():
+        good = f"{int(ok.sum())} of {len(ok)} runs in the fitting set have a margin"
+        return f"{good}, too few for a fit; {most}"
+    return f"every run of the fitting set failed; {most}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -68,10 +69,7 @@ def margin_rows(
             continue
         for period in (fit.period,) if fit.period else d:
             if (beta, period) in fit.unknown:
-                closed[fit.site] = (
-                    f"no margin known: every run of the fitting set failed, or too few for a fit, at fault "
-                    f"{fit.fault}, {period}, {fit.mode}, beta {beta:g}"
-                )
+                closed[fit.site] = _why_unknown(fits, fit, period, beta)
                 break
             a, lower = fit.at(beta, d[period], sites.index(fit.site))
             if float(np.minimum(a, 0.0) @ box) >= lower + NEVER_BINDS:
@@ -80,8 +78,26 @@ def margin_rows(
             if float(np.maximum(a, 0.0) @ box) < lower:
                 closed[fit.site] = f"no capacity in the sampled box passes: {label}"
                 break
-            rows.append(Row(dict(zip(sites, a.tolist(), strict=True)), lower, label, site=fit.site))
+            coefficients = dict(zip(sites, a.tolist(), strict=True))
+            rows.append(Row(coefficients, lower, label, site=fit.site, unit=_unit(fit)))
     return [row for row in rows if row.site not in closed], closed
+
+
+def _unit(fit: Surrogate) -> str:
+    """Unit of the margin that a surrogate gives."""
+    if fit.target == "voltage":
+        return "pu"
+    return "MW" if fit.method == "paper" else "share of load"
+
+
+def _why_unknown(fits: Sequence[Surrogate], fit: Surrogate, period: str, beta: float) -> str:
+    """Why a site is closed at a period and rating; the fault is named unless it is so at every fault."""
+    same = [f for f in fits if f.site == fit.site and f.period in ("", period)]
+    silent = {f.fault: f.unknown[beta, period] for f in same if (beta, period) in f.unknown}
+    everywhere = len(silent) == len({f.fault for f in same})
+    why = Counter(silent.values()).most_common(1)[0][0] if everywhere else silent[fit.fault]
+    fault = "" if everywhere else f"fault {fit.fault}, "
+    return f"no margin known at {fault}{period}, {fit.mode}, beta {beta:g}: {why}"
 
 
 def sweep(

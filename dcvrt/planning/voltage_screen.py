@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dcvrt.errors import InfeasibleError
 from dcvrt.grid.network import Network
 from dcvrt.grid.powerflow import HourlySolution, PowerFlow, hosting_directions, injections
+from dcvrt.planning import reactive
 from dcvrt.planning.profiles import Year
 
 Floats = npt.NDArray[np.float64]
@@ -52,7 +53,7 @@ class HostedFlow:
     """AC power flow of the operating hours at any capacities.
 
     The units follow the hosted load as `powerflow.dispatch` says, the slack takes losses, and `pv` buses hold
-    their voltage without reactive limits.
+    their voltage without reactive limits; `reactive_excess` says how far units are beyond them.
     """
 
     def __init__(self, network: Network, sites: tuple[int, ...], year: Year, pf: float) -> None:
@@ -75,10 +76,33 @@ class HostedFlow:
         at = self._all if hours is None else hours
         if self._latest is None:
             self._latest = self.base.copy()
-        demand = self.scheduled[:, at] + np.outer(self.change.T @ H, self.year.dc[at])
+        demand = self._demand(H, at)
         solved = self.flow.solve_hours(demand, start=self._latest[:, at], hours=self.year.hours[at])
         self._latest[:, at] = np.where(solved.converged, solved.v, self.base[:, at])
         return solved
+
+    def _demand(self, H: Floats, at: Integers) -> npt.NDArray[np.complex128]:
+        """Scheduled injections at `H`, MVA, (buses, hours)."""
+        return self.scheduled[:, at] + np.outer(self.change.T @ H, self.year.dc[at])
+
+    def reactive_excess(
+        self, H: Floats, v: npt.NDArray[np.complex128], hours: Integers
+    ) -> reactive.ReactiveExcess:
+        """How far units are beyond their reactive limits at `H`.
+
+        `v` are the AC voltages at `H`, (buses, hours), of the hours at the given positions.
+        """
+        output = reactive.unit_output(self.network, self._unit_buses, v, self._demand(H, hours))
+        return reactive.excess(self.network, self._unit_buses, output, self.year.hours[hours])
+
+    @cached_property
+    def reactive_unhosted(self) -> reactive.ReactiveExcess:
+        """How far units are beyond their reactive limits with nothing hosted."""
+        return self.reactive_excess(np.zeros(len(self.change)), self.base, self._all)
+
+    @cached_property
+    def _unit_buses(self) -> reactive.UnitBuses:
+        return reactive.UnitBuses.of(self.network)
 
 
 class VoltageScreen:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dcvrt.errors import DcvrtError, did_you_mean, raise_all
+from dcvrt.planning.replay import fault_label
 from dcvrt.studies.config import (
     CriteriaSection,
     FacilitySection,
@@ -21,8 +22,10 @@ from dcvrt.studies.config import (
     PeriodEntry,
     SamplingSection,
     StudyFile,
+    WhatIfEntry,
     read,
 )
+from dcvrt.studies.ranges import do_not_go_together, outside_ranges
 
 if TYPE_CHECKING:
     from dcvrt.grid.network import Network
@@ -53,13 +56,16 @@ def check(text: str, where: str, folder: Path) -> StudyFile:
     if network is not None:
         problems += unknown_buses(sections, network)
     hosting = sections.get("hosting")
+    year = None
     if hosting is not None:
         year, found = _try_profiles(hosting, folder)
         problems += found
         if year is not None:
             problems += unknown_hours(sections, year, network)
+    problems += outside_ranges(sections, year, network)
     if "facility" in sections:
         problems += unknown_variants(sections["facility"])
+        problems += wrong_what_ifs(sections)
     raise_all(problems, where)
     assert file is not None
     return file
@@ -115,10 +121,9 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                 )
                 if 1e-3 * value >= grid.t_end_s
             ]
-    labels = [(fault.bus, fault.t_clear_ms) for fault in faults]
     problems += [
-        f"fault: two faults at bus {bus} are cleared after {ms:g} ms; results could not tell them apart."
-        for bus, ms in _repeated(labels)
+        f"fault: more than one is called {label!r}; results could not tell them apart."
+        for label in _repeated([fault_label(fault.model_dump()) for fault in faults])
     ]
     periods: Sequence[PeriodEntry] = sections.get("period", ())
     problems += [
@@ -130,7 +135,7 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
             problems.append(
                 f"hosting.v_min_pu = {hosting.v_min_pu:g}: must be below v_max_pu = {hosting.v_max_pu:g}."
             )
-        if hosting.hours is not None and not 0 <= hosting.hours[0] < hosting.hours[1]:
+        if not _in_order(hosting.hours):
             problems.append(
                 f"hosting.hours = {hosting.hours}: must be the first hour and the one after the last."
             )
@@ -230,27 +235,98 @@ def unknown_variants(facility: FacilitySection) -> list[str]:
     for mode in facility.modes:
         if mode not in known:
             continue
-        rows = {row.path: row for row in variants.get(mode).compile().parameters if row.path not in SHARED}
-        tables = {
-            "facility.parameters": facility.parameters,
-            f"facility.parameters_by_mode.{mode}": facility.parameters_by_mode.get(mode, {}),
-        }
-        for table, values in tables.items():
-            for path, value in values.items():
-                if path in SHARED:
-                    problems.append(
-                        f'{table}."{path}": is set by the study in every run and cannot be fixed here.'
-                    )
-                elif path not in rows:
-                    problems.append(
-                        f'{table}."{path}": variant {mode!r} has no such parameter.{did_you_mean(path, rows)}'
-                    )
-                elif not rows[path].bounds[0] <= value <= rows[path].bounds[1]:
-                    low, high = rows[path].bounds
-                    problems.append(
-                        f'{table}."{path}" = {value:g} {rows[path].unit}: is outside [{low:g}, {high:g}].'
-                    )
+        rows = _parameters_of(mode)
+        own = facility.parameters_by_mode.get(mode, {})
+        wrong = _wrong_parameters("facility.parameters", facility.parameters, mode, rows)
+        wrong += _wrong_parameters(f"facility.parameters_by_mode.{mode}", own, mode, rows)
+        problems += wrong or do_not_go_together("facility.parameters", mode, facility.parameters | own)
     return list(dict.fromkeys(problems))
+
+
+def wrong_what_ifs(sections: Mapping[str, Any]) -> list[str]:
+    """What-ifs that vary nothing, or what cannot be varied, or to values that cannot be.
+
+    One for a variant that the study leaves out is no mistake: it waits until that variant is studied.
+    """
+    from dcvrt import facility as variants
+
+    facility: FacilitySection = sections["facility"]
+    grid: GridSection | None = sections.get("grid")
+    entries: Sequence[WhatIfEntry] = sections.get("what_if", ())
+    modes = [mode for mode in facility.modes if mode in variants.names()]
+    tables = {mode: _parameters_of(mode) for mode in modes} if entries else {}
+    labels = [entry.label for entry in entries if entry.label is not None]
+    problems = [f"what_if: the label {label!r} is used more than once." for label in _repeated(labels)]
+    for k, entry in enumerate(entries, start=1):
+        if not entry.parameters and not entry.criteria():
+            problems.append(
+                f"what_if[{k}]: varies nothing. Way out: give parameters, or one of the fields of [criteria]."
+            )
+        problems += [
+            f"what_if[{k}].modes: no variant {mode!r}.{did_you_mean(mode, variants.names())}"
+            for mode in entry.modes or ()
+            if mode not in variants.names()
+        ]
+        if grid is not None:
+            problems += [
+                f"what_if[{k}].{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."
+                for name, value in (("window_ms", entry.window_ms), ("loss_window_ms", entry.loss_window_ms))
+                if value is not None and 1e-3 * value >= grid.t_end_s
+            ]
+        for mode in modes if entry.modes is None else [mode for mode in modes if mode in entry.modes]:
+            problems += _wrong_what_if(f"what_if[{k}].parameters", entry, mode, facility, tables)
+    return list(dict.fromkeys(problems))
+
+
+def _wrong_what_if(
+    table: str,
+    entry: WhatIfEntry,
+    mode: str,
+    facility: FacilitySection,
+    tables: Mapping[str, Mapping[str, Any]],
+) -> list[str]:
+    """What is wrong with the parameters of a what-if on one variant."""
+    having = {path: [m for m in tables if path in tables[m]] for path in entry.parameters}
+    elsewhere = [path for path, found in having.items() if found and mode not in found]
+    problems = [
+        f'{table}."{path}": variant {mode!r} has no such parameter. Way out: modes = {having[path]}.'
+        for path in elsewhere
+    ]
+    here = {path: value for path, value in entry.parameters.items() if path not in elsewhere}
+    problems += _wrong_parameters(table, here, mode, tables[mode])
+    if problems or not entry.parameters:
+        return problems
+    studied = facility.parameters | facility.parameters_by_mode.get(mode, {})
+    if do_not_go_together(table, mode, studied):
+        return []  # told where the study sets them
+    return do_not_go_together(table, mode, studied | entry.parameters)
+
+
+def _parameters_of(mode: str) -> dict[str, Any]:
+    """Parameters of a variant that a study file may set, by path."""
+    from dcvrt import facility as variants
+
+    return {row.path: row for row in variants.get(mode).compile().parameters if row.path not in SHARED}
+
+
+def _wrong_parameters(
+    table: str, values: Mapping[str, float], mode: str, rows: Mapping[str, Any]
+) -> list[str]:
+    """Parameters of a table that the study sets itself, that a variant lacks, or that leave their bounds."""
+    problems = []
+    for path, value in values.items():
+        if path in SHARED:
+            problems.append(f'{table}."{path}": is set by the study in every run and cannot be fixed here.')
+        elif path not in rows:
+            problems.append(
+                f'{table}."{path}": variant {mode!r} has no such parameter.{did_you_mean(path, rows)}'
+            )
+        elif not rows[path].bounds[0] <= value <= rows[path].bounds[1]:
+            low, high = rows[path].bounds
+            problems.append(
+                f'{table}."{path}" = {value:g} {rows[path].unit}: is outside [{low:g}, {high:g}].'
+            )
+    return problems
 
 
 def profiles_of(hosting: HostingSection, folder: Path) -> Year:
@@ -261,18 +337,34 @@ def profiles_of(hosting: HostingSection, folder: Path) -> Year:
     InputError
         When the file of profiles is missing or cannot be used.
     """
+    year = _all_hours(hosting, folder)
+    return year if hosting.hours is None else year.window(range(*hosting.hours))
+
+
+def _all_hours(hosting: HostingSection, folder: Path) -> Year:
     from dcvrt.planning import profiles
     from dcvrt.studies.tables import read_profiles
 
-    year = profiles.ieee118() if hosting.profiles == "ieee118" else read_profiles(folder / hosting.profiles)
-    return year if hosting.hours is None else year.window(range(*hosting.hours))
+    return profiles.ieee118() if hosting.profiles == "ieee118" else read_profiles(folder / hosting.profiles)
+
+
+def _in_order(hours: list[int] | None) -> bool:
+    return hours is None or 0 <= hours[0] < hours[1]
 
 
 def _try_profiles(hosting: HostingSection, folder: Path) -> tuple[Year | None, list[str]]:
     try:
-        return profiles_of(hosting, folder), []
+        year = _all_hours(hosting, folder)
     except DcvrtError as error:
         return None, [f"hosting.profiles = {hosting.profiles!r}: {error}"]
+    if hosting.hours is None:
+        return year, []
+    if not _in_order(hosting.hours):
+        return None, []  # told among the contradictions
+    try:
+        return year.window(range(*hosting.hours)), []
+    except DcvrtError as error:
+        return None, [f"hosting.hours = {hosting.hours}: {error}"]
 
 
 def _repeated(values: Sequence[Any]) -> list[Any]:

@@ -8,6 +8,7 @@ nothing else running beside it, so that no task is blamed for another's death.
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 import time
 from collections import deque
@@ -62,13 +63,14 @@ class Cluster:
         self._main = _without_main_file()
         self._main.__enter__()
         if self.scheduler is None:
-            self._cluster = LocalCluster(
-                n_workers=self.workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-            )
+            with _interrupts_held_back():
+                self._cluster = LocalCluster(
+                    n_workers=self.workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
             self._client = Client(self._cluster)
             return self
         try:
@@ -88,10 +90,11 @@ class Cluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._client is not None:
-            self._client.close()
-        if self._cluster is not None:
-            self._cluster.close(timeout=10)
+        with _interrupts_held_back():  # a second Ctrl-C must not leave workers behind
+            if self._client is not None:
+                self._client.close()
+            if self._cluster is not None:
+                self._cluster.close(timeout=10)
         self._main.__exit__(None, None, None)
         self._settings.__exit__(None, None, None)
 
@@ -166,6 +169,27 @@ class Cluster:
             times = "once" if starts == 1 else f"{starts} times"
             return Outcome("died", message=f"its worker died {times} while doing it", seconds=seconds)
         return Outcome("failed", message=f"{type(error).__name__}: {error}"[:500], seconds=seconds)
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of the block; threads and processes started in it never see one.
+
+    Ctrl-C goes to every process of the terminal. It is this one that answers, by closing the workers; if they
+    answered too, each would end with a traceback of its own. Threads and processes inherit the mask of the
+    thread that starts them: the one that looks after the workers starts later ones without interrupts too.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its start lifts the mask of the thread that starts it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+INSTEAD = "in place of that of [criteria]"
 
 
 class Section(BaseModel):
@@ -74,7 +75,7 @@ class FaultEntry(Section):
     """`[[fault]]`: a three-phase fault at a bus, cleared by itself."""
 
     bus: int = Field(description="bus at fault; not a candidate bus")
-    t_start_s: NotNegative = Field(default=0.2, description="inception")
+    t_start_s: Positive = Field(default=0.2, description="inception; the simulation begins before it")
     t_clear_ms: Positive = Field(default=100.0, description="time from inception to clearing")
     x_pu: Positive = Field(default=1e-4, description="fault reactance on the system base")
 
@@ -160,30 +161,27 @@ class RunSection(Section):
 
 
 class WhatIfEntry(Section):
-    """`[[what_if]]`: other values of some parameters or criteria, to see how the least rating moves with them."""
+    """`[[what_if]]`: other parameters or criteria, to see how the least rating moves with them."""
 
     label: str | None = Field(
         default=None, min_length=1, description="what tables call it; default: the values themselves"
     )
     modes: list[str] | None = Field(
-        default=None, min_length=1, description="variants that it is tried on; default: all of the study"
+        default=None,
+        min_length=1,
+        description="variants that it is tried on, as far as they are studied; default: all",
     )
     parameters: dict[str, Finite] = Field(default={}, description="facility parameters, by path")
-    v_it_min_pu: Positive | None = Field(default=None, description="in place of that of [criteria]")
-    window_ms: Positive | None = Field(default=None, description="in place of that of [criteria]")
-    loss_share: Share | None = Field(default=None, description="in place of that of [criteria]")
-    loss_window_ms: NotNegative | None = Field(default=None, description="in place of that of [criteria]")
-    voltage_criterion: Literal["sustained", "instantaneous"] | None = Field(
-        default=None, description="in place of that of [criteria]"
-    )
+    v_it_min_pu: Positive | None = Field(default=None, description=INSTEAD)
+    window_ms: Positive | None = Field(default=None, description=INSTEAD)
+    loss_share: Share | None = Field(default=None, description=INSTEAD)
+    loss_window_ms: NotNegative | None = Field(default=None, description=INSTEAD)
+    voltage_criterion: Literal["sustained", "instantaneous"] | None = Field(default=None, description=INSTEAD)
 
     def criteria(self) -> dict[str, Any]:
         """The criteria that it changes, under the names of `[criteria]`."""
-        return {
-            name: value
-            for name in CriteriaSection.model_fields
-            if (value := getattr(self, name)) is not None
-        }
+        given = self.model_dump(include=set(CriteriaSection.model_fields))
+        return {name: value for name, value in given.items() if value is not None}
 
 
 class StudyFile(BaseModel):
@@ -203,25 +201,22 @@ class StudyFile(BaseModel):
     run: RunSection = RunSection()
     fault: list[FaultEntry] = Field(min_length=1, description="the faults that every site must ride through")
     period: list[PeriodEntry] = Field(min_length=1, description="the hours they are simulated in")
-    what_if: list[WhatIfEntry] = Field(
-        default=[], description="assumptions to vary on the largest plan that passed"
-    )
+    what_if: list[WhatIfEntry] = Field(default=[], description="assumptions to vary on the largest plan")
 
     def canonical(self) -> dict[str, Any]:
-        """Everything that decides a plan, as plain data.
+        """Everything that decides a plan, as plain data: `[run]`, the name and `[[what_if]]` do not.
 
-        `[run]` and `[study] name` do not; `[[what_if]]` is asked of the finished plans, so that a folder may be
-        asked again with other entries.
+        What-ifs are asked of finished plans, so that a folder may be asked again with others.
         """
         data = self.model_dump(mode="json")
         del data["run"], data["what_if"], data["study"]["name"]
         return data
 
     def quick(self) -> StudyFile:
-        """The same study with less of everything that takes time, to see within minutes that all of it works.
+        """The same study with less of what takes time, to see within minutes that all of it works.
 
-        Fewer samples, periods, ratings and what-ifs; every fault, site and mode. The numbers are coarser, and a folder made this way is not continued
-        by a full run.
+        Fewer samples, periods, ratings and what-ifs; every fault, site and mode. The numbers are coarser,
+        and a folder made this way is not continued by a full run.
         """
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})

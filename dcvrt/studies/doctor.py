@@ -10,7 +10,8 @@ from dcvrt.studies.study import versions
 
 def examine() -> tuple[str, bool]:
     """Versions, compiler and caches as text; True when nothing that a study needs is missing."""
-    from dcvrt.integrators import cache_folder, find_compiler
+    from dcvrt.cache import cache_folder
+    from dcvrt.integrators import find_compiler
 
     found = versions()
     healthy = "not installed" not in found.values()

@@ -197,6 +197,11 @@ class Findings:
         """Buses with wind power."""
         return sorted({int(bus) for period in self.periods.values() for bus in period["wind"]})
 
+    @property
+    def anything_simulated(self) -> bool:
+        """Whether at least one facility run has a result."""
+        return bool((self.margins.ok == 1).any())
+
     def rows(self, mode: str | None = None, method: str | None = None) -> list[Row]:
         """Rows of the summary of a mode and a method, by rising beta."""
         chosen = [
@@ -269,11 +274,11 @@ class Findings:
         return said
 
     def limits_of(self, row: Row) -> str:
-        """What keeps a row from hosting more: its closed sites and its dearest limits."""
+        """What keeps a row from hosting more: its closed sites and its highest-priced limits."""
         parts = [f"bus {bus} is closed: {reason.rstrip('.')}" for bus, reason in closed(row).items()]
-        dearest = [binding_text(entry) for entry in binding(row)][:3]
-        if dearest:
-            parts.append("dearest limits: " + "; ".join(dearest))
+        highest = [binding_text(entry) for entry in binding(row)][:3]
+        if highest:
+            parts.append("highest-priced limits: " + "; ".join(highest))
         text = ". ".join(part[0].upper() + part[1:] for part in parts)
         return f"{text or 'No limit is recorded for this row'}."
 

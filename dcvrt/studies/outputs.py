@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.store import Store, records
@@ -26,6 +28,28 @@ STORE, SUMMARY, TABLE, VALIDATION, STUDY = (
     "validation.csv",
     "study.toml",
 )
+
+
+def refuse_unusable(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written into, before any work is done; leaves no trace.
+
+    Raises
+    ------
+    InputError
+        Saying what is in the way.
+    """
+    way_out = "Way out: take another folder with --out."
+    place = folder
+    try:
+        while not place.exists():
+            place = place.parent
+        if not place.is_dir():
+            what = "is a file, not a folder" if place == folder else f"cannot be made: {place} is a file"
+            raise InputError(f"{folder} {what}. {way_out}")
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written: {place}: {error.strerror}. {way_out}") from None
 
 
 def write_atomically(path: Path, text: str) -> Path:
@@ -75,7 +99,7 @@ def _plan(plan: Mapping[str, Any], engine: str) -> dict[str, Any]:
         "binding": binding(plan),
         "replay": {
             "engine": engine,
-            "passed": bool(plan["passed"]),
+            "passed": bool(plan["passed"]) if plan["total_mw"] > 0 else None,  # nothing to replay
             **{
                 key: plan[key]
                 for key in ("worst_voltage_margin_pu", "worst_loss_margin_mw", "aggregate_loss_mw")
@@ -125,6 +149,7 @@ def surrogate_scores(store: Store) -> list[dict[str, Any]]:
                 "violation_rate": s.violation_rate,
                 "n_fit": int(fitted.n_fit.sum()),
                 "n_validation": s.n,
+                "n_validation_failed": s.n_failed,
             }
         )
     return rows

@@ -26,6 +26,8 @@ from dcvrt.studies.store import Store, records
 SAMPLES, REPLAYS = "samples", "replays"
 NO_VRT = "none"
 """Method of the plan without ride-through."""
+REACTIVE = "reactive"
+"""Entry of a plan's `worst` that the power flow writes: units beyond their reactive limits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +158,10 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             rows = records(margins[here])
             is_open = sum(mw > 0 for mw in by_site.values())
             expected = is_open * len(setting.periods) * len(setting.file.fault)
-            store.put("plans", [plan | replay.verdict(rows, by_site, expected) | {"replayed": 1}])
+            found = replay.verdict(rows, by_site, expected)
+            of_power_flow = {key: value for key, value in plan["worst"].items() if key == REACTIVE}
+            found["worst"] = found["worst"] | of_power_flow
+            store.put("plans", [plan | found | {"replayed": 1}])
     return lost
 
 
@@ -213,6 +218,7 @@ def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> M
         loss_share=frame.loss_margin_share.to_numpy(dtype=float),
         loss_mw=frame.loss_margin_mw.to_numpy(dtype=float),
         ok=frame.ok.to_numpy(dtype=bool),
+        status=frame.status.to_numpy(dtype=str),
         sequence=frame.sequence.to_numpy(dtype=str),
         fit=(samples.subset[frame.hosting] == "fit").to_numpy(dtype=bool),
         name=frame.hosting.to_numpy(dtype=str),
@@ -230,7 +236,7 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
                 name: getattr(fit, name)
                 for name in ("method", "mode", "site", "fault", "target", "period", "beta")
             }
-            scores = {name: value for name, value in asdict(fit.scores).items() if name != "n"}
+            scores = {k: value for k, value in asdict(fit.scores).items() if k not in ("n", "n_failed")}
             store.put(
                 "surrogates",
                 [
@@ -241,9 +247,10 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
                         "slopes": dict(zip(map(str, setting.sites), fit.slopes.tolist(), strict=True)),
                         "rating_slope": fit.rating_slope,
                         "tightening": fit.tightening,
-                        "unknown": [list(place) for place in fit.unknown],
+                        "unknown": [[*place, why] for place, why in fit.unknown.items()],
                         "n_fit": fit.n_fit,
                         "n_validation": fit.scores.n,
+                        "n_validation_failed": fit.scores.n_failed,
                         "n_excluded": fit.n_excluded,
                         "n_mixed": fit.n_mixed,
                         "n_sequences": fit.n_sequences,
@@ -282,7 +289,7 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
                     fit.intercept,
                     *fit.slopes.tolist(),
                     fit.rating_slope,
-                    fit.unknown,
+                    [[*place, why] for place, why in fit.unknown.items()],
                 ]
                 for fit in fits
             ]
@@ -364,11 +371,13 @@ def _ac(problem: HostingProblem, plan: Plan) -> dict[str, Any]:
         seen = problem.check_ac(plan)
     except DcvrtError as error:
         return {"ac_passed": 0, "ac_v_min_pu": None, "ac_v_error_pu": None, "ac_status": str(error)}
+    excess = {"plan": seen.reactive, "unhosted": seen.reactive_unhosted}
     return {
         "ac_passed": int(seen.passed),
         "ac_v_min_pu": seen.v_min_pu,
         "ac_v_error_pu": seen.v_error_pu,
         "ac_status": seen.status,
+        "worst": {REACTIVE: {name: asdict(found) for name, found in excess.items() if found is not None}},
     }
 
 

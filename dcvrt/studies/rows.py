@@ -11,7 +11,7 @@ Row = Mapping[str, Any]
 def verdict(row: Row) -> str:
     """Outcome of the replay of a row: passed, failed, or nothing hosted and so nothing replayed.
 
-    >>> verdict({"total_mw": 0.0, "replay": {"passed": True}})
+    >>> verdict({"total_mw": 0.0, "replay": {"passed": None}})
     'nothing hosted'
     >>> verdict({"total_mw": 9.0, "replay": {"passed": False}})
     'failed'
@@ -37,7 +37,7 @@ def carried(row: Row) -> str:
 
 
 def binding(row: Row) -> list[Row]:
-    """Limits that bind in a row, dearest first."""
+    """Limits that bind in a row, highest price first."""
     return [entry for entry in row["binding"] if entry["kind"] not in ("closed", "carried")]
 
 

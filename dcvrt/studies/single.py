@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dcvrt.errors import InputError, did_you_mean
-from dcvrt.studies.outputs import write_atomically
+from dcvrt.studies.outputs import refuse_unusable, write_atomically
 
 if TYPE_CHECKING:
     from dcvrt.trajectory import Trajectory
@@ -33,11 +33,18 @@ def ride(
     -------
     text, complete : str, bool
         What to show, and whether the run reached the end of the waveform.
+
+    Raises
+    ------
+    InputError
+        For an unknown variant or waveform, or a folder that cannot be written.
     """
     from dcvrt import facility
     from dcvrt.criteria import Criteria, margins
     from dcvrt.integrators import Simulator
 
+    if out is not None:
+        refuse_unusable(out)
     simulator = Simulator(facility.get(variant).compile(), save_at=1e-3)
     run = simulator.attempt(waveform_of(waveform, named), H=1.0, beta=beta)
     lines = [

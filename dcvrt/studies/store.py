@@ -23,24 +23,26 @@ else those
 `surrogates`   one fitted margin: method, mode, site, fault, target ('voltage' or 'loss'), period ('' where
 pooled),
                beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening;
-               unknown ([beta, period] at which no run has a margin: the site counts as not passing there);
-               n_fit, n_validation, n_excluded (failed runs), n_mixed (fitting points whose event sequence is
-               not the most common one), n_sequences; mae, rmse, worst_over, worst_under, violation_rate, on
-               the validation set.
+               unknown ([beta, period, why] where no run has a margin: the site counts as not passing there);
+               n_fit, n_validation (points with a margin), n_validation_failed (points without one, as their
+               run failed), n_excluded (failed runs of the fitting set), n_mixed (fitting points whose event
+               sequence is not the most common one), n_sequences; mae, rmse, worst_over, worst_under,
+               violation_rate, on the validation set.
 `predictions`  validation points of every surrogate, numbered: method, mode, site, fault, target, period,
 beta,
-               hosting, point, margin, predicted.
+               hosting, point, margin (NULL where the run failed), predicted.
 `plans`        method ('none' is the plan without ride-through), mode, beta, hosting, total_mw, by_site,
 binding and
                closed (JSON), carried_from (the smaller beta it was found at, or empty), ac_passed,
                ac_v_min_pu, ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed,
                worst_voltage_margin_pu, worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss,
-               aggregate: where}, n_failed.
+               aggregate: where; reactive: {plan, unhosted: units beyond their reactive limits in the AC power
+               flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed.
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
-               (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name, unit,
-               studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
-               low and high, between which it was searched; rating (NULL when high is not enough). Derived from
-               the waveforms of the replays, written as a whole and emptied when its inputs change:
+               (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
+               unit, studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
+               low and high, between which it was searched; rating (NULL when high is not enough). Derived
+               from the waveforms of the replays, written as a whole and anew when its inputs change:
                `what_ifs_from` in `provenance` is their digest.
 """
 
@@ -85,12 +87,13 @@ TABLES = {
     "surrogates": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
     "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, intercept REAL, slopes TEXT NOT NULL, "
     "rating_slope REAL, tightening REAL, unknown TEXT NOT NULL, n_fit INTEGER, n_validation INTEGER, "
+    "n_validation_failed INTEGER, "
     "n_excluded INTEGER, "
     "n_mixed INTEGER, n_sequences INTEGER, mae REAL, rmse REAL, worst_over REAL, worst_under REAL, "
     "violation_rate REAL, PRIMARY KEY (method, mode, site, fault, target, period, beta)",
     "predictions": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
     "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, "
-    "point INTEGER NOT NULL, margin REAL NOT NULL, predicted REAL NOT NULL, "
+    "point INTEGER NOT NULL, margin REAL, predicted REAL NOT NULL, "
     "PRIMARY KEY (method, mode, site, fault, target, period, beta, point)",
     "plans": "method TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw "
     "REAL NOT NULL, "
@@ -119,7 +122,8 @@ class Store:
     Raises
     ------
     InputError
-        When there is no store to read, it was made by another version, or another run is writing.
+        When there is no store to read, it is damaged, it was made by another version, or another run is
+        writing.
     """
 
     def __init__(self, path: str | Path, write: bool = False) -> None:
@@ -130,11 +134,11 @@ class Store:
             )
         self._guard = _only_writer(self.path) if write else None
         self._base = sqlite3.connect(self.path, isolation_level=None, timeout=30.0)
-        if write:
-            self._base.execute("PRAGMA journal_mode = WAL")
-            self._base.execute("PRAGMA synchronous = NORMAL")
         try:
             version = self._base.execute("PRAGMA user_version").fetchone()[0]
+            if write:
+                self._base.execute("PRAGMA journal_mode = WAL")
+                self._base.execute("PRAGMA synchronous = NORMAL")
         except sqlite3.DatabaseError as error:
             self.close()
             raise InputError(
@@ -150,6 +154,12 @@ class Store:
             raise InputError(
                 f"{self.path}: store version {version}, this dcvrt reads version {VERSION}. "
                 "Way out: run the study again into a new folder."
+            )
+        if (damage := self.integrity()) != "ok":
+            self.close()
+            raise InputError(
+                f"{self.path}: the file is damaged ({damage}). Way out: put a copy of it back, or run the "
+                "study again into a new folder."
             )
 
     def close(self) -> None:
@@ -321,8 +331,12 @@ class Store:
         }
 
     def integrity(self) -> str:
-        """'ok', or what SQLite finds wrong with the file."""
-        return str(self._base.execute("PRAGMA integrity_check").fetchone()[0])
+        """'ok', or the first of what SQLite finds wrong with the pages of the file."""
+        try:
+            found = str(self._base.execute("PRAGMA quick_check(1)").fetchone()[0])
+        except sqlite3.DatabaseError as error:
+            return str(error)
+        return found.splitlines()[-1]
 
     def _frame(
         self, table: str, where: str = "", values: Sequence[Any] = (), order: str = "1"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +21,8 @@ from dcvrt.studies.store import Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from dcvrt.dae import ParameterTable
 
 PACKAGES = ("numpy", "scipy", "casadi", "andes", "highspy", "distributed", "pandas", "pydantic")
 DECIDING = ("dcvrt", "numpy", "scipy", "casadi", "andes", "highspy")
@@ -90,7 +93,8 @@ class Study:
         Raises
         ------
         InputError
-            When the folder holds another study, or was made with other versions.
+            When the folder cannot be written, holds another study, or was made with other versions; when
+            the compiler fails or no scheduler answers, and then no folder is made.
         InfeasibleError
             When the network cannot serve its own load; nothing is written then.
         """
@@ -99,24 +103,25 @@ class Study:
         folder = Path(out) if out is not None else Path(f"{self.name}-{'quick' if quick else 'results'}")
         reporter = reporter or Silent()
         crew = crew_of(workers, scheduler)  # before any work: a wrong number of workers is bad input
+        outputs.refuse_unusable(folder)
         reporter.say(f"{file.study.name}{' (quick)' if quick else ''}: into {folder}")
         if (folder / outputs.STORE).is_file():
             with Store(folder / outputs.STORE) as store:
                 refuse_another_study(store, file, folder)
         setting = self._setting(file)
         reporter.say(f"without ride-through: {setting.no_vrt.total_mw:.2f} MW")
-        folder.mkdir(parents=True, exist_ok=True)
-        with Store(folder / outputs.STORE, write=True) as store:
-            refuse_another_study(store, file, folder)
-            self._note(store, file, setting, quick)
-            outputs.write_atomically(folder / outputs.STUDY, self.text)
-            if retry and store.reopen(*LOST):
-                (folder / outputs.SUMMARY).unlink(missing_ok=True)
-            backends = prepare(file, setting)
-            store.note(backends=backends)
-            for mode, backend in backends.items():
-                reporter.say(f"{mode}: {backend}")
-            with crew as hands, reporter:
+        backends = prepare(file, setting)
+        for mode, backend in backends.items():
+            reporter.say(f"{mode}: {backend}")
+        with crew as hands:  # all that may be refused has been: from here on the folder belongs to this study
+            folder.mkdir(parents=True, exist_ok=True)
+            with Store(folder / outputs.STORE, write=True) as store, reporter:
+                refuse_another_study(store, file, folder)
+                self._note(store, file, setting, quick)
+                store.note(backends=backends)
+                outputs.write_atomically(folder / outputs.STUDY, self.text)
+                if retry and store.reopen(*LOST):
+                    (folder / outputs.SUMMARY).unlink(missing_ok=True)
                 campaign = Campaign(store, hands, file.run.task_timeout_s, file.run.tries, reporter)
                 try:
                     lost = phases.run_samples(campaign, setting)
@@ -126,7 +131,7 @@ class Study:
                     what_if.run_what_ifs(store, setting, reporter)
                 finally:
                     store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
-            outputs.write_results(folder, store)
+                outputs.write_results(folder, store)
         result = Result(folder, lost)
         result.report()
         return result
@@ -163,8 +168,10 @@ class Study:
 
     def _note(self, store: Store, file: StudyFile, setting: phases.Setting, quick: bool) -> None:
         """Write down what the study is and what it is made with."""
-        from dcvrt import facility
-
+        parameters = {
+            mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
+            for mode in file.facility.modes
+        }
         with store.transaction():
             store.note(
                 study=file.canonical(),
@@ -190,14 +197,12 @@ class Study:
                             "doc": row.doc,
                             "source": row.source,
                         }
-                        for row in facility.get(mode).compile().parameters
+                        for row in _facility(mode, parameters[mode])
+                        if row.path not in checks.SHARED  # each run has those of its place in the study
                     ]
                     for mode in file.facility.modes
                 },
-                parameters={
-                    mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
-                    for mode in file.facility.modes
-                },
+                parameters=parameters,
             )
 
 
@@ -262,6 +267,16 @@ class Result:
         return [*files, *draw_all(self.folder), write_report(self.folder)]
 
 
+def _facility(mode: str, parameters: Mapping[str, float]) -> ParameterTable:
+    """Parameters of a variant with the values that the study gives some of them."""
+    from dcvrt import facility
+
+    diagram = facility.get(mode)
+    for path, value in parameters.items():
+        diagram.set(path, value, "study file")
+    return diagram.compile().parameters
+
+
 def versions() -> dict[str, str]:
     """Versions of everything that a number may depend on."""
     found = {"dcvrt": dcvrt.__version__, "python": platform.python_version()}
@@ -283,14 +298,13 @@ def prepare(file: StudyFile, setting: phases.Setting) -> dict[str, str]:
     """
     from dcvrt.planning import replay
 
-    return {
-        mode: replay.prepare(
-            setting.request(
-                [0.0] * len(setting.sites), next(iter(setting.periods)), [(mode, 1.0)], keep=False
-            )
-        )
-        for mode in file.facility.modes
-    }
+    backends = {}
+    for mode in file.facility.modes:
+        runs = [(mode, beta) for beta in file.facility.beta]
+        for period in setting.periods:
+            request = setting.request([0.0] * len(setting.sites), period, runs, keep=False)
+            backends[mode] = replay.prepare(request)
+    return backends
 
 
 def refuse_another_study(store: Store, file: StudyFile, folder: Path) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 
 import numpy as np
 
+from dcvrt.delimited import read_table
 from dcvrt.errors import InputError, raise_all
 from dcvrt.planning.profiles import Year
 
@@ -22,13 +22,12 @@ def read_profiles(path: Path) -> Year:
     InputError
         With every problem at once: missing columns, cells that are not numbers, values out of range.
     """
-    if not path.is_file():
-        raise InputError(f"{path.name}: no such file.")
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = list(csv.reader(file))
-    if not rows:
-        raise InputError(f"{path.name}: is empty.")
-    header = [name.strip() for name in rows[0]]
+    table = read_table(path)
+    header = table.header
+    if not header:
+        raise InputError(
+            f"{path}: the table has no header; its columns are hour, load, dc and wind_<bus>_mw."
+        )
     needed = ["hour", "load", "dc"]
     problems = [f"no column {name!r}. It has: {', '.join(header)}." for name in needed if name not in header]
     problems += [
@@ -36,21 +35,10 @@ def read_profiles(path: Path) -> Year:
         for name in header
         if name not in needed and not WIND.fullmatch(name)
     ]
-    problems += [
-        f"line {k} has {len(row)} cells, the header has {len(header)}."
-        for k, row in enumerate(rows[1:], start=2)
-        if len(row) != len(header)
-    ][:3]
-    raise_all(problems, path.name)
-    columns = {}
-    for c, name in enumerate(header):
-        try:
-            columns[name] = np.array([float(row[c]) for row in rows[1:]])
-        except ValueError as error:
-            problems.append(f"column {name!r}: {error}.")
-    raise_all(problems, path.name)
+    raise_all(problems, str(path))
+    columns = dict(zip(header, table.numbers(range(table.width)).T, strict=True))
     if (columns["hour"] != np.round(columns["hour"])).any():
-        raise InputError(f"{path.name}: column 'hour' must hold whole numbers.")
+        raise InputError(f"{path}: column 'hour' must hold whole numbers.")
     wind = {int(found[1]): columns[name] for name in header if (found := WIND.fullmatch(name))}
     return Year(
         hours=columns["hour"].astype(np.int64),

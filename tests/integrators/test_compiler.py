@@ -13,8 +13,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError
-from dcvrt.integrators import NoCompilerWarning, Simulator, cache_folder, compiler, find_compiler
+from dcvrt.integrators import NoCompilerWarning, Simulator, compiler, find_compiler
 from tests.integrators.systems import ball, flat
 
 

@@ -326,12 +326,41 @@ def test_a_wrt_that_nobody_knows() -> None:
         ({"wrt": ("a", "a")}, "wrt names a twice."),
         ({"save_at": 0.0}, "save_at = 0 s must be positive."),
         ({"start": "rest"}, "start = 'rest' must be 'equilibrium' or 'given'."),
+        (
+            {"solver": "cvodes"},
+            "solver = 'cvodes': must be solver options. Way out: solver=Casadi('cvodes'), or leave it out.",
+        ),
+        ({"solver": 5}, "solver = 5: must be solver options. Way out: solver=Casadi(...), or leave it out."),
     ],
 )
 def test_unusable_options(arguments: dict, message: str) -> None:
     with pytest.raises(InputError) as error:
         Simulator(lag(), **arguments)
     assert str(error.value) == message
+
+
+def test_what_is_no_waveform_and_no_criteria() -> None:
+    simulator = Simulator(lag())
+    no_waveform = (
+        "'sag' is no waveform. Way out: Waveform.sag(...), Waveform.ercot_style(), Waveform.from_csv(path) "
+        "or Waveform(t, v)."
+    )
+    for call in (
+        lambda: simulator("sag"),
+        lambda: simulator.attempt("sag"),
+        lambda: simulator.batch("sag", {}),
+        lambda: simulator.batch([flat(), "sag"], {}),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        assert str(error.value) == no_waveform
+    for call in (
+        lambda: simulator.batch([flat()], {}, criteria="x"),
+        lambda: margins(simulator(flat()), "x"),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        assert str(error.value) == "criteria = 'x': must be criteria. Way out: criteria=Criteria(...)."
 
 
 def test_unusable_solver_options() -> None:
@@ -372,6 +401,20 @@ def test_unknown_signals_of_a_run() -> None:
     with pytest.raises(InputError) as error:
         run.sens["x_out", "b"]
     assert str(error.value) == "'b' is not among the wrt of this simulator. Known: a."
+
+
+def test_a_plot_that_cannot_be_written(tmp_path) -> None:
+    run = Simulator(lag())(flat())
+    with pytest.raises(InputError) as error:
+        run.plot(tmp_path / "no" / "ride.svg")
+    assert str(error.value) == (
+        f"plot: {tmp_path / 'no' / 'ride.svg'} cannot be written: No such file or directory. "
+        "Way out: another path."
+    )
+    with pytest.raises(
+        InputError, match=r"ride\.xyz: .* Way out: a path that ends with \.svg, \.png or \.pdf\.$"
+    ):
+        run.plot(tmp_path / "ride.xyz")
 
 
 def test_plot(tmp_path) -> None:

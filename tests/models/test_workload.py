@@ -114,10 +114,10 @@ def test_traces_by_column_name_and_from_npy(tmp_path):
         ("t,p\n0,1\n1,1\n2,1\n50,1\n51,1\n",
          "gap of 48 s after 2 s (line 4); the usual step is 1 s. "
          "Fill the gap or give the part before or after it."),
-        ("t,p\n0,1\n1,x\n2,1\n", "line 3: 'x' is not a number."),
-        ("t,p\n0,1\n1\n2,1\n", "line 3: '' is not a number."),
+        ("t,p\n0,1\n1,x\n2,1\n", "line 3, column 'p': 'x' is not a number."),
+        ("t,p\n0,1\n1\n2,1\n", "line 3 has 1 cells, the table 2."),
         ("t,p\n0,1\n", "a trace needs two samples or more; it has 1."),
-        ("hello\n", "no line with numbers in two columns or more was found."),
+        ("hello\n", "no line has two columns or more."),
         ("t,p\n0,-1\n1,-1\n", "the mean power is -1; it must be positive. Is the column the right one?"),
         ("t,p\n0,1\n1,1\n2,-1\n3,1\n4,1\n",
          "with gain = 1 the load falls to -2, below 0. Take a smaller gain."),

@@ -61,6 +61,24 @@ def test_site_whose_row_fails_at_zero_is_closed_with_the_reason(problem: Hosting
     assert plan.total_mw > 200
 
 
+def test_reason_of_a_closed_site_and_price_of_a_row_have_units(problem: HostingProblem) -> None:
+    failing = [replace(margin(75, -0.02 - 0.001 * k, -1e-4, f"fit {k}"), unit="pu") for k in range(3)]
+    for count, more in (
+        (1, ""),
+        (2, ", and 1 more margin falls short"),
+        (3, ", and 2 more margins fall short"),
+    ):
+        plan = problem.solve(failing[:count])
+        short = 0.019 + 0.001 * count + 0.5e-4 * sum(plan.by_site.values())
+        assert plan.closed == {
+            75: f"fit {count - 1}: {short:.4g} pu short at 0 MW beside the other sites{more}"
+        }
+    bound = Row({75: -1.0}, -50.0, "at most 50 MW at 75")
+    for row, unit in ((replace(bound, unit="MW"), "MW per MW"), (bound, "MW per unit of the row")):
+        plan = problem.solve([row])
+        assert [b.unit for b in plan.binding if b.kind == "row"] == [unit]
+
+
 def test_every_site_may_close(problem: HostingProblem) -> None:
     plan = problem.solve([margin(bus, -1.0, -1e-4) for bus in SITES])
     assert plan.total_mw == 0.0

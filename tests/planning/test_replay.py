@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
-from dcvrt.planning.replay import fault_label, lost_rows, modes_passed, verdict
+import pytest
+
+from dcvrt.planning.replay import _facility_rows, fault_label, lost_rows, modes_passed, verdict
 
 REQUEST = {
     "sites": [21, 75],
@@ -114,3 +116,15 @@ def test_modes_are_read_from_a_real_run() -> None:
         *[event.target for event in run.events],
     ]
     assert run.events
+
+
+def test_rows_keep_the_loading_before_the_fault() -> None:
+    from dcvrt import Waveform
+
+    sag = Waveform.sag(retained=0.8, start=0.1, length=0.1, until=0.4)
+    request = {"parameters": {}, "pf": 0.98, "criteria": {}}
+    ratings = [1.01, 1.2]
+    rows = _facility_rows(request, "peak", "bus 32, 100 ms", "gfl", ratings, {21: sag}, {21: 30.0}, 1.0)
+    preload = [r["diagnostics"]["preload"] for r in rows]
+    assert preload[0] == pytest.approx(1.0, abs=1e-3)  # 1/0.98 would be needed
+    assert preload[1] == pytest.approx(1 / (0.98 * 1.2), rel=1e-4)

@@ -4,6 +4,7 @@ rating."""
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,12 +30,13 @@ def surrogate(
     mode="gfl",
     period="",
     target="loss",
-    unknown=(),
+    unknown=None,
+    fault="bus 32, 100 ms",
 ) -> Surrogate:
     return Surrogate(
         method,
         site,
-        "bus 32, 100 ms",
+        fault,
         mode,
         target,
         period,
@@ -43,12 +45,12 @@ def surrogate(
         np.array(slopes),
         rating,
         0.0,
-        unknown,
+        unknown or {},
         10,
         0,
         0,
         1,
-        Scores(0, *[float("nan")] * 5),
+        Scores(0, 0, *[float("nan")] * 5),
         NOTHING,
     )
 
@@ -70,6 +72,21 @@ def test_rows_are_the_surrogate_in_every_period() -> None:
     assert rows[0].label == "loss at bus 75, fault bus 32, 100 ms, peak, gfl, beta 1.2"
 
 
+@pytest.mark.parametrize(
+    ("method", "target", "unit"),
+    [
+        ("paper", "voltage", "pu"),
+        ("paper", "loss", "MW"),
+        ("share", "voltage", "pu"),
+        ("share", "loss", "share of load"),
+    ],
+)
+def test_rows_have_the_unit_of_their_margin(method: str, target: str, unit: str) -> None:
+    fit = replace(surrogate(75, 0.5, slopes=(0.0, -0.02, 0.0, 0.0)), method=method, target=target)
+    rows, _ = margin_rows([fit], SITES, 1.2, D, np.full(4, 100.0))
+    assert {row.unit for row in rows} == {unit}
+
+
 def test_rows_that_hold_everywhere_are_left_out_and_hopeless_ones_close_their_site() -> None:
     fits = [
         surrogate(21, 0.5, slopes=(-1e-3, 0, 0, 0)),
@@ -84,14 +101,26 @@ def test_rows_that_hold_everywhere_are_left_out_and_hopeless_ones_close_their_si
 
 
 def test_a_site_whose_margin_is_unknown_is_closed() -> None:
-    fits = [surrogate(75, 1.0, unknown=((1.0, "light"),))]
-    assert margin_rows(fits, SITES, 1.2, D, np.full(4, 100.0)) == ([], {})
+    why = "every run of the fitting set failed; the reason: gfl: no equilibrium"
+    fits = [
+        surrogate(75, 1.0, unknown={(1.0, "light"): why}),
+        surrogate(75, 1.0, fault="bus 9, 100 ms"),
+        surrogate(21, 1.0, fault="bus 9, 100 ms", unknown={(1.2, "peak"): "of another site"}),
+    ]
     rows, closed = margin_rows(fits, SITES, 1.0, D, np.full(4, 100.0))
     assert not rows
-    assert closed == {
-        75: "no margin known: every run of the fitting set failed, or too few for a fit, at fault "
-        "bus 32, 100 ms, light, gfl, beta 1"
-    }
+    assert closed == {75: f"no margin known at fault bus 32, 100 ms, light, gfl, beta 1: {why}"}
+    assert margin_rows(fits[:2], SITES, 1.2, D, np.full(4, 100.0)) == ([], {})
+
+
+def test_a_reason_that_holds_for_every_fault_names_none() -> None:
+    fits = [
+        surrogate(75, 1.0, unknown={(1.0, "light"): why}, fault=fault, target=target)
+        for fault, why in (("bus 32, 100 ms", "rare"), ("bus 9, 100 ms", "usual"), ("bus 8, 100 ms", "usual"))
+        for target in ("voltage", "loss")
+    ]
+    _, closed = margin_rows(fits, SITES, 1.0, D, np.full(4, 100.0))
+    assert closed == {75: "no margin known at light, gfl, beta 1: usual"}
 
 
 def test_a_site_without_a_passing_capacity_is_closed_and_the_others_stay(problem: HostingProblem) -> None:

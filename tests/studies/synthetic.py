@@ -14,7 +14,7 @@ import numpy as np
 
 from dcvrt.planning import replay
 from dcvrt.planning.sampling import sample_hosting
-from dcvrt.studies import outputs, phases
+from dcvrt.studies import outputs, phases, what_if
 from dcvrt.studies.config import StudyFile, load
 from dcvrt.studies.store import Store
 
@@ -95,7 +95,12 @@ def checked_run(
 
 
 def make(
-    folder: Path, *, failing: bool = True, lost: bool = False, name: str = "A study of four sites"
+    folder: Path,
+    *,
+    failing: bool = True,
+    lost: bool = False,
+    nothing: bool = False,
+    name: str = "A study of four sites",
 ) -> Path:
     """Write a finished study folder.
 
@@ -103,6 +108,7 @@ def make(
     ----------
     failing : the replay finds one per cent less voltage than the samples, so that some plans fail it.
     lost : one sampled task was set aside.
+    nothing : every facility run failed.
     """
     file = study_file(name)
     folder.mkdir(parents=True, exist_ok=True)
@@ -141,11 +147,13 @@ def make(
                     )
                 ],
             )
-            store.put("margins", [{"hosting": key, **row} for row in _rows(file, H)])
+            rows = [_failed(row) for row in _rows(file, H)] if nothing else _rows(file, H)
+            store.put("margins", [{"hosting": key, **row} for row in rows])
         if lost:
             _lose(store, file)
         phases.run_fits(store, setting)  # type: ignore[arg-type]
         _plans(store, file, failing)
+        _what_ifs(store, file)
         outputs.write_results(folder, store)
     return folder
 
@@ -160,6 +168,13 @@ def _rows(file: StudyFile, H: np.ndarray, scale: float = 1.0) -> list[dict[str, 
         for beta in file.facility.beta
     ]
     return [_weakened(row, file, scale) for row in rows] if scale != 1.0 else rows
+
+
+def _failed(row: dict[str, Any]) -> dict[str, Any]:
+    mode, H = row["mode"], row["h_mw"]
+    where = (row["period"], row["fault"], row["site"], mode, row["beta"])
+    status = f"{mode}: no equilibrium at the first value of the waveform. Largest residuals:\n  dc.w = 1"
+    return replay._row(*where, H, status, "facility")
 
 
 def _weakened(row: dict[str, Any], file: StudyFile, scale: float) -> dict[str, Any]:
@@ -246,9 +261,42 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
             if (row["mode"], row["beta"]) == (plan["mode"], plan["beta"])
         ]
         expected = int((H > 0).sum()) * len(file.period) * len(file.fault)
-        store.put("margins", [{"hosting": plan["hosting"], **row} for row in rows])
+        if H.any():  # a plan of nothing is not replayed
+            store.put("margins", [{"hosting": plan["hosting"], **row} for row in rows])
         store.put("plans", [plan | replay.verdict(rows, by_site, expected) | {"replayed": 1}])
         _waveforms(store, file, plan, rows)
+
+
+def _what_ifs(store: Store, file: StudyFile) -> None:
+    """Least ratings by the static law, and made-up ones of a parameter; one that no rating makes up for."""
+    setting = SimpleNamespace(file=file, no_vrt=SimpleNamespace(total_mw=sum(CORNER)))
+    for mode, plan in what_if.largest_passed(store, setting).items():  # type: ignore[arg-type]
+        H = np.array([plan["by_site"][str(site)] for site in SITES])
+        least = min(
+            retained(fault, site, H, d)
+            for fault in LEAST
+            for k, site in enumerate(SITES)
+            if H[k] > 0
+            for _, _, d, _ in PERIODS.values()
+        )
+        studied = (1.0 - file.criteria.loss_share) / least
+        share = {"name": "criteria.loss_share", "unit": "1", "studied": file.criteria.loss_share}
+        gain = {"name": "dc_loop.K_p", "unit": "1", "studied": 1.0, "varied": 2.0}
+        asked: list[tuple[str, list[dict[str, Any]], float | None]] = [
+            ("as studied", [], studied),
+            ("loss <share> 20 %", [share | {"varied": 0.2}], 0.8 / least),
+            ("loss share 1 %", [share | {"varied": 0.01}], None),
+            ("twice the gain of the $DC$ loop_", [gain], studied + 0.05),
+        ]
+        for number, (label, changes, rating) in enumerate(asked if mode == "gfm" else asked[:3]):
+            store.put(
+                "what_ifs",
+                [
+                    {"mode": mode, "number": number, "label": label, "changes": changes}
+                    | {name: plan[name] for name in ("method", "beta", "hosting", "total_mw")}
+                    | {"n_waveforms": 8, "low": what_if.LOW, "high": what_if.HIGH, "rating": rating}
+                ],
+            )
 
 
 def _plan(

@@ -150,6 +150,42 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, workers: int) -> None
     assert not {f"{int(n):03}" for n in repeated} & done, "a finished task was done again"
 
 
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signal masks")
+def test_an_interrupt_from_the_terminal_ends_a_run_on_workers_without_a_word(tmp_path: Path) -> None:
+    """It reaches every process of the terminal; a worker that has replaced a killed one is no exception."""
+    script = tmp_path / "slow_run.py"
+    script.write_text(
+        SLOW_RUN.replace(
+            "    time.sleep(0.15)",
+            "    if payload['n'] == 1 and open(payload['log']).read().split().count('1') == 1:\n"
+            "        import os, signal\n"
+            "        os.kill(os.getpid(), signal.SIGKILL)\n"
+            "    time.sleep(0.5)",
+        )
+    )
+    log = tmp_path / "log.txt"
+    command = [sys.executable, str(script), str(tmp_path), "2", str(log)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and (not log.exists() or len(log.read_text().split()) < 8):
+        time.sleep(0.02)
+    os.killpg(run.pid, signal.SIGINT)
+    _, told = run.communicate(timeout=60)
+    assert told.count("Traceback") == 1, "only that of this script"
+    assert told.rstrip().endswith("KeyboardInterrupt")
+    assert "Worker" not in told
+    with Store(tmp_path / "study.sqlite") as store:
+        done = set(store.hostings().name)
+        assert set(store.tasks().status) == {"done", "open"}
+    assert 0 < len(done) < 12
+    subprocess.run(command, check=True, timeout=120, env=environment)
+    with Store(tmp_path / "study.sqlite") as store:
+        assert (store.tasks().status == "done").all()
+
+
 def test_a_task_that_took_the_whole_process_down_too_often_is_not_started_again(tmp_path: Path) -> None:
     with Store(tmp_path / "study.sqlite", write=True) as store:
         store.add_tasks([(t.key, "squares", t.text) for t in tasks(2)])

@@ -47,6 +47,8 @@ def test_quick_keeps_faults_sites_and_modes() -> None:
     assert len(quick.period) < len(file.period)
     assert set(quick.facility.beta) < set(file.facility.beta)
     assert quick.facility.beta[-1] == file.facility.beta[-1]
+    assert len(quick.what_if) == 3
+    assert all(entry in file.what_if for entry in quick.what_if)
     checks.check(config.template(), "quick", HERE)
     assert not checks.contradictions({name: getattr(quick, name) for name in config.StudyFile.model_fields})
 
@@ -58,7 +60,9 @@ def test_the_canonical_form_leaves_out_what_decides_nothing() -> None:
         "a",
     )
     reseeded = config.load(changed(("seed = 1", "seed = 2")), "a")
-    assert file.canonical() == renamed.canonical() != reseeded.canonical()
+    asked = config.load(changed(("loss_share = 0.20", "loss_share = 0.21")), "a")
+    assert file.canonical() == renamed.canonical() == asked.canonical() != reseeded.canonical()
+    assert file.what_if != asked.what_if
 
 
 def test_schema_is_json_and_knows_every_table() -> None:
@@ -79,7 +83,7 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
         "my.toml: 7 problems\n"
         "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
         "sampling, surrogate, run, "
-        "fault, period.\n"
+        "fault, period, what_if.\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
         "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "
         "step_s, redispatch.\n"
@@ -145,6 +149,77 @@ def test_parameter_out_of_bounds_and_unknown() -> None:
     )
 
 
+def test_what_ifs_that_can_vary_nothing_are_told_all_at_once() -> None:
+    text = changed(
+        (
+            "[[what_if]]",
+            """[[what_if]]
+label = "nothing"
+
+[[what_if]]
+label = "nothing"
+loss_window_ms = 2000.0
+
+[[what_if]]
+modes = ["gfm", "gfx"]
+parameters = { "lag.tau" = 0.003 }
+
+[[what_if]]
+parameters = { "sup.V_back" = 0.88, "sup.V_calm" = 1.09 }
+modes = ["gfl"]
+
+[[what_if]]
+parameters = { "vsm.D" = 600.0, "beta" = 1.2 }
+modes = ["gfm"]
+
+[[what_if]]""",
+        )
+    )
+    assert complaint(text) == (
+        "my.toml: 7 problems\n"
+        "  what_if: the label 'nothing' is used more than once.\n"
+        "  what_if[1]: varies nothing. Way out: give parameters, or one of the fields of [criteria].\n"
+        "  what_if[2].loss_window_ms = 2000: is longer than the simulation of 2 s.\n"
+        "  what_if[3].modes: no variant 'gfx'. Did you mean 'gfm'? Known: gfl, gfm.\n"
+        "  what_if[4].parameters: gfl: sup (Supervisor): 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or "
+        "w < w_sag' and 'MIXED -> NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave "
+        "no gap between them (V_dip = 0.9, V_swell = 1.1, w_sag = 0.85, V_back = 0.88, V_calm = 1.09, w_back "
+        "= 0.95): the modes would chatter. Set the limit of the way back beyond that of the way out.\n"
+        '  what_if[5].parameters."vsm.D" = 600 1: is outside [0, 500].\n'
+        '  what_if[5].parameters."beta": is set by the study in every run and cannot be fixed here.'
+    )
+
+
+def test_a_what_if_names_the_variant_without_its_parameter() -> None:
+    found = complaint(
+        changed(('modes = ["gfm"]\nparameters = { "vsm.D" = 15.0 }', 'parameters = { "vsm.D" = 15.0 }'))
+    )
+    assert found == (
+        "my.toml: what_if[9].parameters.\"vsm.D\": variant 'gfl' has no such parameter. Way out: "
+        "modes = ['gfm']."
+    )
+    found = complaint(changed(('"vsm.H_v" = 0.15', '"vsm.H_w" = 0.15')))
+    assert found.startswith(
+        "my.toml: what_if[12].parameters.\"vsm.H_w\": variant 'gfm' has no such parameter. Did you mean "
+        "'vsm.H_v'? Known: "
+    )
+
+
+def test_a_what_if_of_a_variant_that_is_not_studied_waits() -> None:
+    text = changed(('modes = ["gfl", "gfm"]', 'modes = ["gfl"]'))
+    assert any(entry.modes == ["gfm"] for entry in checks.check(text, "my.toml", HERE).what_if)
+
+
+def test_fields_of_a_what_if_are_told_with_their_place() -> None:
+    text = changed(('label = "loss share 20 %"\nloss_share = 0.20', 'lable = "x"\nloss_share = 1.2'))
+    assert complaint(text) == (
+        "my.toml: 2 problems\n"
+        "  what_if[1].loss_share = 1.2: must be below 1.\n"
+        "  what_if[1].lable: unknown field. Did you mean 'label'? Known: label, modes, parameters, "
+        "v_it_min_pu, window_ms, loss_share, loss_window_ms, voltage_criterion."
+    )
+
+
 def test_fields_that_contradict_each_other() -> None:
     text = changed(
         ("t_end_s = 2.0", "t_end_s = 0.25"),
@@ -167,7 +242,7 @@ def test_fields_that_contradict_each_other() -> None:
         "  sampling.n = 7: leaves 5 hosting vectors to fit a margin of 4 sites, 6 are needed. Way out: "
         "raise sampling.n or lower "
         "sampling.validation_share.",
-        "  fault: two faults at bus 25 are cleared after 100 ms; results could not tell them apart.",
+        "  fault: more than one is called 'bus 25, 100 ms'; results could not tell them apart.",
         "  period: the name 'peak' is used more than once.",
         "  hosting.v_min_pu = 1.2: must be below v_max_pu = 1.06.",
         "  facility.beta = [1.3, 1.05, 1.1, 1.125, 1.15, 1.175, 1.2, 1.25, 1.3, 1.35, 1.4, 1.5]: must rise "
@@ -210,18 +285,18 @@ def test_unknown_case_and_missing_dynamics() -> None:
     ("table", "told"),
     [
         ("hour,load\n0,1.0\n", "no column 'dc'. It has: hour, load."),
-        ("hour,load,dc\n0,1.0,x\n", "column 'dc': could not convert string to float: 'x'."),
+        ("hour,load,dc\n0,1.0,x\n", "line 2, column 'dc': 'x' is not a number."),
         ("hour,load,dc,wind\n0,1.0,1.0,3\n", "column 'wind' is none of hour, load, dc, wind_<bus>_mw."),
-        ("hour,load,dc\n0,1.0\n", "line 2 has 2 cells, the header has 3."),
+        ("hour,load,dc\n0,1.0\n", "line 2 has 2 cells, the table 3."),
         ("hour,load,dc\n0.5,1.0,1.0\n", "column 'hour' must hold whole numbers."),
-        ("", "is empty."),
+        ("", "no line has two columns or more."),
     ],
 )
 def test_bad_profiles_are_told(tmp_path: Path, table: str, told: str) -> None:
     (tmp_path / "hours.csv").write_text(table)
     with pytest.raises(InputError) as caught:
         read_profiles(tmp_path / "hours.csv")
-    assert str(caught.value) == f"hours.csv: {told}"
+    assert str(caught.value) == f"{tmp_path / 'hours.csv'}: {told}"
 
 
 def test_profiles_are_read_with_their_wind(tmp_path: Path) -> None:
@@ -234,5 +309,67 @@ def test_profiles_are_read_with_their_wind(tmp_path: Path) -> None:
 
 def test_profiles_of_a_study_may_be_missing(tmp_path: Path) -> None:
     assert complaint(changed(('profiles = "ieee118"', 'profiles = "hours.csv"')), tmp_path) == (
-        "my.toml: hosting.profiles = 'hours.csv': hours.csv: no such file."
+        f"my.toml: hosting.profiles = 'hours.csv': {tmp_path / 'hours.csv'}: there is no such file."
+    )
+
+
+def test_values_that_a_facility_run_would_refuse(tmp_path: Path) -> None:
+    hours = "".join(f"{hour},{1 - 0.01 * hour},{dc}\n" for hour, dc in enumerate([0.05, 1.0, 0.09]))
+    (tmp_path / "hours.csv").write_text(f"hour,load,dc\n{hours}")
+    text = changed(
+        ("beta = [1.0, 1.05", "beta = [0.5, 1.05"),
+        (" 1.5]", " 1.5, 9.0]"),
+        ("pf = 0.98", "pf = 0.5"),
+        ('profiles = "ieee118"', 'profiles = "hours.csv"'),
+    )
+    both, d = "of gfl and gfm may have.", "[0.1, 1.2], which parameter d"
+    assert complaint(text, tmp_path).splitlines() == [
+        "my.toml: 5 problems",
+        f"  facility.beta[1] = 0.5: is outside [0.8, 2], which parameter beta {both}",
+        f"  facility.beta[13] = 9: is outside [0.8, 2], which parameter beta {both}",
+        f"  hosting.pf = 0.5: is outside [0.8, 1], which parameter pf {both}",
+        f"  period[1]: the data-centre factor of hour 0 = 0.05: is outside {d} {both}",
+        f"  period[3]: the data-centre factor of hour 2 = 0.09: is outside {d} {both}",
+    ]
+
+
+def test_a_fault_needs_a_time_before_it() -> None:
+    text = changed(("bus = 25 ", "t_start_s = 0.0\nbus = 25 "))
+    assert complaint(text) == "my.toml: fault[1].t_start_s = 0.0: must be above 0."
+
+
+def test_parameters_that_do_not_go_together() -> None:
+    told = (
+        "sup (Supervisor): 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' and 'MIXED -> "
+        "NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap between them (V_dip "
+        "= 0.9, V_swell = 1.1, w_sag = 0.85, V_back = 0.88, V_calm = 1.08, w_back = 0.95): the modes would "
+        "chatter. Set the limit of the way back beyond that of the way out."
+    )
+    assert complaint(changed(('# "sup.T_dip" = 0.25', '"sup.V_back" = 0.88'))) == (
+        f"my.toml: 2 problems\n  facility.parameters: gfl: {told}\n  facility.parameters: gfm: {told}"
+    )
+
+
+def test_faults_that_tables_would_call_the_same() -> None:
+    text = changed(("bus = 30 ", "bus = 25 "))
+    first = text.index("t_clear_ms = 100.0", text.index("bus = 25 ", text.index("bus = 25 ") + 1))
+    text = text[:first] + "t_clear_ms = 100.0000001" + text[first + len("t_clear_ms = 100.0") :]
+    assert complaint(text) == (
+        "my.toml: fault: more than one is called 'bus 25, 100 ms'; results could not tell them apart."
+    )
+
+
+@pytest.mark.parametrize(
+    ("hours", "told"),
+    [
+        ("[168, 10]", "hosting.hours = [168, 10]: must be the first hour and the one after the last."),
+        (
+            "[0, 9999]",
+            "hosting.hours = [0, 9999]: hour 8760 is not among the 8760 operating hours (0 to 8759).",
+        ),
+    ],
+)
+def test_hours_that_are_none(hours: str, told: str) -> None:
+    assert complaint(changed(('profiles = "ieee118"', f'profiles = "ieee118"\nhours = {hours}'))) == (
+        f"my.toml: {told}"
     )

@@ -12,7 +12,7 @@ import pytest
 from dcvrt import facility
 from dcvrt.errors import InputError
 from dcvrt.grid.network import Network
-from dcvrt.studies.figures import capacity, draw_all, faults, layout, supervisor, validation, worst
+from dcvrt.studies.figures import capacity, draw_all, faults, layout, supervisor, validation, what_if, worst
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.rows import by_site, closed, verdict
 from dcvrt.studies.store import Store
@@ -31,6 +31,7 @@ NAMES = {
     "internal_response_gfl",
     "internal_response_gfm",
     "supervisor",
+    "what_if",
 }
 
 
@@ -89,6 +90,7 @@ def test_no_text_is_smaller_than_can_be_read_in_print(folder: Path) -> None:
             capacity.draw_allocation(findings),
             validation.draw(findings),
             faults.draw(findings),
+            what_if.draw(findings),
         ):
             assert min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text()) >= 6.0
 
@@ -202,6 +204,32 @@ def test_retained_voltage_is_the_one_of_the_store(folder: Path) -> None:
             assert (row["min"], row["max"]) == pytest.approx((min(volts), max(volts)), abs=1e-12)
 
 
+def test_bars_of_the_assumptions_reach_from_the_studied_rating_to_the_varied_one(folder: Path) -> None:
+    findings = Findings(folder)
+    with styled():
+        figure = what_if.draw(findings)
+    assert figure is not None
+    for axes, mode in zip(figure.axes, findings.modes, strict=True):
+        base, varied = what_if.rows_of(findings, mode)
+        assert base is not None
+        labels = [t.get_text() for t in axes.get_yticklabels()]
+        bars = dict(zip(labels, axes.patches, strict=True))
+        for row in varied:
+            bar = bars[row["label"]]
+            ends = sorted([bar.get_x(), bar.get_x() + bar.get_width()])
+            end = axes.get_xlim()[1] if row["rating"] is None else row["rating"]
+            assert ends == pytest.approx(sorted([base["rating"], end]))
+        assert labels[0] == "loss share 1 %", "what no rating makes up for stands on top"
+        assert "none up to 2" in texts_of(axes)
+
+
+def test_without_what_ifs_there_is_no_such_figure(tmp_path: Path) -> None:
+    make(tmp_path)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        store.clear("what_ifs")
+    assert what_if.draw(Findings(tmp_path)) is None
+
+
 def test_rating_line_is_the_static_loss_law() -> None:
     for beta in (1.0, 1.2, 1.5):
         v = faults.rating_line(beta, 0.1)
@@ -255,6 +283,14 @@ def test_supervisor_diagram_shows_every_row_of_the_table(variant: str) -> None:
 def test_shipped_coordinates_are_the_computed_ones() -> None:
     network = Network.ieee118()
     assert layout.positions(network) == pytest.approx(layout.computed(network), abs=0.05)
+
+
+def test_the_table_of_coordinates_is_what_was_computed(tmp_path: Path) -> None:
+    network = Network.ieee118()
+    layout.write_table(network, str(tmp_path / "118.csv"))
+    written = np.loadtxt(tmp_path / "118.csv", delimiter=",", skiprows=2)
+    assert written[:, 0].tolist() == network.bus.tolist()
+    assert written[:, 1:] == pytest.approx(layout.computed(network), abs=5e-4 + 1e-9)
 
 
 def test_majorisation_never_raises_the_stress() -> None:

@@ -111,7 +111,7 @@ def test_tables_have_captions_and_headers_and_pictures_have_texts(page: Page) ->
     assert len(page.all("table")) == len(page.all("caption")) >= 8
     assert all(attributes.get("scope") in ("col", "row") for attributes in page.all("th"))
     pictures = page.all("svg")
-    assert len(pictures) == 11
+    assert len(pictures) == 12
     assert all(attributes["role"] == "img" and len(attributes["aria-label"]) > 20 for attributes in pictures)
     assert page.all("html")[0]["lang"] == "en"
     assert [attributes["content"] for attributes in page.all("meta") if attributes.get("name") == "viewport"]
@@ -213,12 +213,98 @@ def test_false_passes_are_told(tmp_path: Path, folder: Path) -> None:
     assert "method share, GFM, load loss: 2 validation point(s)" in text
 
 
+def test_a_failed_validation_run_that_a_fit_passes_is_a_false_pass_everywhere(
+    tmp_path: Path, folder: Path
+) -> None:
+    from dcvrt.studies.figures import validation
+
+    make(tmp_path)
+    before = {key(row): row for row in Findings(tmp_path).summary["surrogate"]}
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        points = store.predictions()
+        chosen = points[(points.method == "share") & (points["mode"] == "gfm") & (points.target == "loss")]
+        lost = chosen.sort_values("predicted").iloc[[0, -1]].to_dict("records")
+        assert lost[0]["predicted"] < 0 < lost[1]["predicted"], "one is not passed, the other is"
+        store.put("predictions", [row | {"margin": None} for row in lost])
+        outputs.write_results(tmp_path, store)
+    findings = Findings(tmp_path)
+    for row in findings.summary["surrogate"]:
+        was, here = before[key(row)], key(row) == ("share", "gfm", "loss")
+        assert (row["n_validation"], row["n_validation_failed"]) == (
+            was["n_validation"] - 2 * here,
+            2 * here,
+        )
+        total = was["n_validation"]
+        assert row["violation_rate"] == pytest.approx(was["violation_rate"] + here / total)
+    assert "method share, GFM, load loss: 1 validation point(s)" in page_of(tmp_path, folder).text
+    shown = [text.get_text() for axes in validation.draw(findings).axes for text in axes.texts]
+    assert any("(2 have no margin to show, 1 of them false passes)" in text for text in shown)
+
+
+def key(row: dict) -> tuple[str, str, str]:
+    return row["method"], row["mode"], row["target"]
+
+
 def test_assumptions_name_what_is_illustrative_and_the_modes_differences(page: Page) -> None:
     assert "parameters are illustrative" in page.text
     assert "Parameters that differ between the modes" in page.text
     assert "dc_loop.K_p" in page.text
     assert "not ERCOT's official one" in page.text
     assert "Positive sequence only." in page.text
+
+
+def test_the_least_rating_stands_beside_every_assumption_that_was_varied(
+    folder: Path, page: Page, source: str
+) -> None:
+    assert "How the answer moves with the assumptions" in page.text
+    section = source[source.index('id="what-if"') :]
+    for row in Findings(folder).what_ifs.to_dict("records"):
+        if row["number"]:
+            assert html.escape(row["label"]) in section
+            if row["rating"] == row["rating"]:
+                assert f">{row['rating']:.3f}<" in section
+    rows = {(row["mode"], row["number"]): row for row in Findings(folder).what_ifs.to_dict("records")}
+    change = rows["gfm", 1]["rating"] - rows["gfm", 0]["rating"]
+    assert (
+        f"loss <share> 20 % criteria.loss_share = 0.1 0.2 {rows['gfm', 0]['rating']:.3f} "
+        f"{rows['gfm', 1]['rating']:.3f} {change:+.3f}"
+    ) in page.text
+    assert "GFM: no rating up to 2 makes up for 'loss share 1 %'." in page.text
+    assert "twice the gain of the $DC$ loop_ dc_loop.K_p = 1 2 " in page.text
+
+
+def test_parameters_that_differ_by_mode_lead_to_their_effect(page: Page) -> None:
+    assert (
+        "How the answer moves with dc_loop.K_p: see How the answer moves with the assumptions ." in page.text
+    )
+    assert "The effect of dc_loop.K_i was not studied; a [[what_if]] in the study file adds it." in page.text
+    assert "#what-if" in [attributes["href"] for attributes in page.all("a")]
+
+
+def test_without_what_ifs_or_without_a_plan_the_report_says_so(tmp_path: Path, folder: Path) -> None:
+    make(tmp_path)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        store.clear("what_ifs")
+    text = page_of(tmp_path, folder).text
+    assert "No assumption was varied: the study has no [[what_if]]." in text
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        store.put("plans", [plan | {"passed": 0} for plan in store.plans().to_dict("records")])
+        outputs.write_results(tmp_path, store)
+    write_report(tmp_path)
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    for mode in ("GFL", "GFM"):
+        assert f"{mode}: no plan passed, so there is none whose rating could be sought." in text
+
+
+def test_parameters_that_the_study_sets_are_shown_with_its_values(source: str) -> None:
+    rows = {
+        re.sub("<[^>]+>", "|", row).strip("|").split("|")[0]: re.sub("<[^>]+>", "|", row)
+        for row in re.findall(r"<tr>(.*?)</tr>", source[source.index("Parameters of the GFL facility") :])
+    }
+    for path, value in {"beta": "1 to 1.5", "pf": "0.98", "d": "0.9 to 1", "H": "1, on the base of"}.items():
+        assert f"|{value}" in rows[path]
+        assert "|set by the study|" in rows[path]
+    assert "set by the study" not in rows["PUE"]
 
 
 def test_every_deviation_of_the_models_is_listed(folder: Path, page: Page) -> None:

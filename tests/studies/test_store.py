@@ -123,6 +123,22 @@ def test_what_is_no_store_is_told(tmp_path: Path) -> None:
     )
 
 
+def test_damaged_pages_are_told_when_the_store_is_opened(tmp_path: Path) -> None:
+    path = tmp_path / "study.sqlite"
+    with Store(path, write=True) as store, store.transaction():
+        store.put("margins", [margin(f"s{k:04}", 1.0) for k in range(200)])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:40960] + b"\x5a" * 8192 + whole[49152:])
+    for write in (False, True):
+        with pytest.raises(InputError) as caught:
+            Store(path, write=write)
+        told = str(caught.value)
+        assert told.startswith(f"{path}: the file is damaged (")
+        assert told.endswith("). Way out: put a copy of it back, or run the study again into a new folder.")
+    path.write_bytes(whole)
+    Store(path, write=True).close()  # and the lock was let go of
+
+
 def test_another_version_is_refused(tmp_path: Path) -> None:
     Store(tmp_path / "s", write=True).close()
     with sqlite3.connect(tmp_path / "s") as base:
@@ -130,7 +146,7 @@ def test_another_version_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         Store(tmp_path / "s")
     assert str(caught.value) == (
-        f"{tmp_path / 's'}: store version 7, this dcvrt reads version 1. "
+        f"{tmp_path / 's'}: store version 7, this dcvrt reads version 2. "
         "Way out: run the study again into a new folder."
     )
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from dcvrt.errors import InputError
+from dcvrt.planning import replay
 from dcvrt.studies import outputs
 from dcvrt.studies.config import load, template
 from dcvrt.studies.store import Store, records
@@ -97,6 +98,69 @@ def test_a_folder_made_with_other_versions_is_refused(tmp_path: Path) -> None:
         f"{tmp_path} was made with other versions:\n  casadi: was 3.6.0, is {versions()['casadi']}\n"
         "Way out: take another folder with --out, or undo the change."
     )
+
+
+@pytest.mark.parametrize(
+    ("out", "told"),
+    [
+        ("taken", "is a file, not a folder"),
+        ("taken/below", "cannot be made: {place} is a file"),
+        ("taken/far/below", "cannot be made: {place} is a file"),
+    ],
+)
+def test_a_folder_that_cannot_be_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str, told: str
+) -> None:
+    monkeypatch.setattr(Study, "_setting", lambda *_: pytest.fail("work was done"))
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(InputError) as caught:
+        Study.load(small(tmp_path)).run(tmp_path / out)
+    told = told.format(place=tmp_path / "taken")
+    assert str(caught.value) == f"{tmp_path / out} {told}. Way out: take another folder with --out."
+
+
+def test_a_folder_without_permission_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(outputs.tempfile, "TemporaryFile", refused)
+    with pytest.raises(InputError) as caught:
+        outputs.refuse_unusable(tmp_path / "a" / "b")
+    assert str(caught.value) == (
+        f"{tmp_path / 'a' / 'b'} cannot be written: {tmp_path}: Permission denied. "
+        "Way out: take another folder with --out."
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_refused_before_the_first_task_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study.load(small(tmp_path))
+    with pytest.raises(InputError, match="no dask scheduler answers"):
+        study.run(tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    replay._simulator.cache_clear()
+    monkeypatch.setenv("CC", "/bin/false")
+    with pytest.raises(InputError, match=r"^CC = '/bin/false' is not a compiler that runs"):
+        study.run(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_values_that_no_run_takes_are_refused_before_the_first_task(tmp_path: Path) -> None:
+    request = {
+        "runs": [["gfl", 1.0], ["gfl", 9.0]],
+        "parameters": {},
+        "period": {"dc_factor": 0.05},
+        "pf": 0.98,
+    }
+    with pytest.raises(InputError) as caught:
+        replay.prepare(request | {"runs": [["gfl", 1.0]]})
+    assert str(caught.value) == "d = 0.05 is outside [0.1, 1.2]."
+    with pytest.raises(InputError) as caught:
+        replay.prepare(request | {"period": {"dc_factor": 1.0}})
+    assert str(caught.value) == "beta = 9 is outside [0.8, 2]."
 
 
 def test_an_unfinished_study_has_no_result(tmp_path: Path) -> None:
@@ -185,6 +249,7 @@ def check_summary(summary: dict) -> None:
         assert set(row["replay"]) == {
             "engine", "passed", "worst_voltage_margin_pu", "worst_loss_margin_mw", "aggregate_loss_mw",
         }  # fmt: skip
+        assert (row["replay"]["passed"] is None) == (row["total_mw"] == 0)
         assert set(row["ac"]) == {"passed", "v_min_pu", "v_error_pu"}
         assert row["total_mw"] == pytest.approx(sum(row["by_site"].values()))
         assert row["total_mw"] <= summary["no_vrt"]["total_mw"] + 1e-3
@@ -194,5 +259,5 @@ def check_summary(summary: dict) -> None:
     for row in summary["surrogate"]:
         assert set(row) == {
             "method", "mode", "target", "mae", "rmse", "worst_over", "worst_under", "violation_rate", "n_fit",
-            "n_validation",
+            "n_validation", "n_validation_failed",
         }  # fmt: skip

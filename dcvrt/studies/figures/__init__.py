@@ -51,6 +51,7 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         network_map,
         supervisor,
         validation,
+        what_if,
         worst,
     )
 
@@ -78,4 +79,7 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         run, _ = internal_response.on_test_waveform(findings, mode)
         if run is not None:
             yield f"internal_response_{mode}", internal_response.draw(findings, mode, run)
+    tornado = what_if.draw(findings)
+    if tornado is not None:
+        yield "what_if", tornado
     yield "supervisor", supervisor.draw(findings.facility(findings.modes[0]))

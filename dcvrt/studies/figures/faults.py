@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dcvrt.studies.config import FaultEntry
+from dcvrt.planning.replay import fault_label
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.style import GREY, INK, MARKERS, PAGE, new_figure, site_colour
 
@@ -19,11 +19,6 @@ def retained(margins: pd.DataFrame) -> pd.DataFrame:
     """Lowest POI voltage by fault and site: smallest, middle and largest over hosting vectors and periods."""
     once = margins.dropna(subset=["v_poi_min_pu"]).drop_duplicates(["hosting", "period", "fault", "site"])
     return once.groupby(["fault", "site"]).v_poi_min_pu.agg(["min", "median", "max"]).reset_index()
-
-
-def fault_name(fault: FaultEntry) -> str:
-    """What the store calls a fault of the study file."""
-    return f"bus {fault.bus}, {fault.t_clear_ms:g} ms"
 
 
 def rating_line(beta: float, loss_share: float) -> float:
@@ -41,7 +36,8 @@ def draw(findings: Findings) -> Figure:
     """One line a fault, one marker a site; the bar spans hosting vectors and periods."""
     table, sites = retained(findings.margins), findings.sites
     present = set(table.fault)
-    faults = [name for name in map(fault_name, findings.faults) if name in present]
+    labels = [fault_label(fault.model_dump()) for fault in findings.faults]
+    faults = [name for name in labels if name in present]
     figure = new_figure(PAGE, 0.95 + 0.36 * max(len(faults), 1))
     axes = figure.add_subplot()
     spread = np.linspace(0.27, -0.27, len(sites)) if len(sites) > 1 else np.zeros(1)
@@ -77,7 +73,7 @@ def draw(findings: Findings) -> Figure:
                 rotation=60,
             )
     axes.set_yticks(range(len(faults)), faults)
-    axes.set_ylim(len(faults) - 0.5, -0.5)
+    axes.set_ylim(max(len(faults), 1) - 0.5, -0.5)
     axes.set_xlabel("lowest POI voltage during the fault (pu)")
     axes.set_ylabel("fault")
     axes.grid(axis="y", visible=False)

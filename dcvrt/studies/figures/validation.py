@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.planning.surrogate import false_passes
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.style import (
     FAILED,
@@ -108,7 +109,9 @@ def _scatter(
         rasterized=len(fit_margin) > 1500,
         zorder=1.5,
     )
-    false = (points.predicted >= 0) & (points.margin < 0)
+    without = points[points.margin.isna()]
+    points = points[points.margin.notna()]
+    false = false_passes(points.predicted, points.margin)
     for mode in modes:
         own = points[points["mode"] == mode]
         axes.plot(
@@ -144,12 +147,17 @@ def _scatter(
     axes.axhline(0, color=GREY, linewidth=0.6, linestyle=(0, (3, 2)), zorder=1)
     axes.axvline(0, color=GREY, linewidth=0.6, linestyle=(0, (3, 2)), zorder=1)
     axes.fill_between([limits[0], 0], 0, limits[1], color="#f8dcd6", alpha=0.6, linewidth=0, zorder=0)
-    count = int(np.sum(false))
-    share = int((points.margin < 0).sum())
+    unseen = int(false_passes(without.predicted, without.margin).sum())
+    count = int(false.sum()) + unseen
+    total, share = len(points) + len(without), int((points.margin < 0).sum()) + len(without)
+    hidden = (
+        f"\n({len(without)} have no margin to show, {unseen} of them false passes)" if len(without) else ""
+    )
     axes.text(
         0.03,
         0.97,
-        f"validation: {count} false passes\namong {len(points)} points, of which\n{share} fail in simulation",
+        f"validation: {count} false passes\namong {total} points, of which\n"
+        f"{share} fail in simulation{hidden}",
         transform=axes.transAxes,
         va="top",
         linespacing=1.25,

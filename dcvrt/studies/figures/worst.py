@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dcvrt.studies.figures.faults import fault_name
+from dcvrt.planning.replay import fault_label
 from dcvrt.studies.figures.ride import shade_modes
 from dcvrt.studies.findings import Case, Findings
 from dcvrt.studies.style import (
@@ -125,7 +125,7 @@ def _window(
     """Time from shortly before the fault to when the supervisor has settled, or the end of the record."""
     ends = [float(s["t_s"][-1]) for s in [*grid.values(), *([signals] if signals else [])]]
     end = max(ends, default=1.0)
-    fault = next((f for f in findings.faults if fault_name(f) == case.fault), None)
+    fault = next((f for f in findings.faults if fault_label(f.model_dump()) == case.fault), None)
     if fault is None:
         return 0.0, end
     cleared = fault.t_start_s + 1e-3 * fault.t_clear_ms

@@ -11,7 +11,7 @@ from string import Template
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
-from dcvrt.studies.report import answer, checks, grid, hypotheses, models, plans, record
+from dcvrt.studies.report import answer, checks, grid, hypotheses, models, plans, record, what_if
 from dcvrt.studies.report.page import Safe, escape
 
 REPORT = "report.html"
@@ -28,6 +28,7 @@ SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     models.facility,
     record.simulations,
     models.assumptions,
+    what_if.what_if,
     models.deviations,
     record.method,
     record.provenance,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dcvrt.planning import surrogate
 from dcvrt.studies.findings import Findings
+from dcvrt.studies.report import caveats
+from dcvrt.studies.report.caveats import name_of
 from dcvrt.studies.report.page import Safe, bullets, escape, notice, paragraph, section
 from dcvrt.studies.report.record import failed_runs
-from dcvrt.studies.rows import Row, ac_verdict, by_site, verdict
+from dcvrt.studies.rows import ac_verdict, by_site, verdict
 from dcvrt.studies.style import mode_name
 
 TARGETS = {"voltage": "IT voltage", "loss": "load loss"}
@@ -27,6 +30,11 @@ def headline(findings: Findings) -> str:
     A plan counts only when the replay and the power flow passed it.
     """
     best, limit = findings.best(), findings.no_vrt_mw
+    if not findings.anything_simulated:
+        return (
+            f"Nothing could be simulated: none of the {len(findings.margins)} facility runs has a result, so "
+            f"that no hosted load could be tested. Without ride-through it would be {limit:.1f} MW."
+        )
     if best is None or best["total_mw"] <= 0:
         return (
             "No data-centre load can be hosted at the sites studied with any mode and rating studied, if "
@@ -100,6 +108,9 @@ def _warnings(findings: Findings) -> Safe:
                 bullets([f"{name_of(row)}: {findings.plan(row)['ac_status']}" for row in ac]),
             )
         )
+    reactive = caveats.reactive_limits(findings)
+    if reactive:
+        boxes.append(notice("Reactive limits of the units are not enforced", bullets(reactive)))
     counts = findings.summary["simulations"]
     if counts["failed"] or counts["quarantined"]:
         boxes.append(
@@ -132,6 +143,15 @@ def _warnings(findings: Findings) -> Safe:
     falls = findings.falls()
     if falls:
         boxes.append(notice("Capacity falls somewhere as β rises", bullets(falls)))
+    edge = caveats.lower_bounds(findings)
+    if edge:
+        boxes.append(
+            notice(
+                "Some capacities are lower bounds",
+                Safe(paragraph(caveats.LOWER_BOUNDS) + bullets(edge)),
+                "neutral",
+            )
+        )
     short = findings.shortfalls()
     if short:
         boxes.append(
@@ -143,25 +163,20 @@ def _warnings(findings: Findings) -> Safe:
     if not failed:
         good.append("Every plan that hosts anything passed the replay.")
     if not falls:
-        good.append("Capacity never falls as β rises.")
+        good.append(f"Capacity never falls as β rises ({caveats.why_it_never_falls(findings)}).")
     if not short:
         good.append("The highest β reaches the capacity without ride-through in every mode and method.")
     if not sum(false.values()):
         good.append("No fit passed a validation point that the simulation failed.")
-    if good:
+    if good and findings.anything_simulated:
         boxes.append(notice("What holds", bullets(good), "good"))
     return Safe("".join(boxes))
-
-
-def name_of(row: Row) -> str:
-    """Mode, rating and method of a row in words."""
-    return f"{mode_name(row['mode'])}, β = {row['beta']:g}, method {row['method']}"
 
 
 def false_passes(findings: Findings) -> dict[tuple[str, str, str], int]:
     """Validation points predicted to pass that fail in simulation, by method, mode and target."""
     points = findings.predictions
-    wrong = points[(points.predicted >= 0) & (points.margin < 0)]
+    wrong = points[surrogate.false_passes(points.predicted, points.margin)]
     return {
         (row["method"], row["mode"], row["target"]): int(
             (

@@ -27,9 +27,10 @@ def validation(findings: Findings) -> Safe:
                 unit,
                 *[number(score[name], digits) for name in ("mae", "rmse", "worst_over", "worst_under")],
                 str(false[key]),
-                number(100.0 * score["violation_rate"], 2, "–"),
+                "–" if (rate := score["violation_rate"]) is None else number(100.0 * rate, 2),
                 str(score["n_fit"]),
                 str(score["n_validation"]),
+                str(score["n_validation_failed"]),
                 str(int(own.n_excluded.sum())),
                 str(int((own.n_sequences > 1).sum())),
             ]
@@ -49,7 +50,8 @@ def validation(findings: Findings) -> Safe:
         "violation rate (%)",
         "points fitted",
         "validation points",
-        "failed runs left out",
+        "failed validation runs",
+        "failed runs left out of the fit",
         "fits of mixed sequences",
     ]
     return section(
@@ -57,9 +59,9 @@ def validation(findings: Findings) -> Safe:
         paragraph(
             "Each margin is fitted on some of the samples, lowered by its largest overprediction there, "
             "and judged on samples that the fit has not seen. A false pass is a point that the fit passes "
-            "and the simulation fails; the conservative-violation rate is their share of all validation "
-            "points. MAE is the mean absolute error, RMSE the root mean square error; those of the two "
-            "methods have different units."
+            "and whose margin is negative or whose simulation failed; the conservative-violation rate is "
+            "their share of all validation points, with a margin or without one. MAE is the mean absolute "
+            "error, RMSE the root mean square error; those of the two methods have different units."
         ),
         table("Validation of the surrogates after tightening", head, rows, words=[1, 2, 3], marked=marked),
         figure(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dcvrt.studies.figures.faults import fault_name, retained
+from dcvrt.planning.replay import fault_label
+from dcvrt.studies.figures.faults import retained
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, figure, number, paragraph, section, table
 
@@ -20,7 +21,7 @@ def grid(findings: Findings) -> Safe:
         hardest[site] = ranked[0][1] if ranked else ""
     fault_rows = []
     for fault in findings.faults:
-        name = fault_name(fault)
+        name = fault_label(fault.model_dump())
         cells = [
             "–" if (name, s) not in lowest else f"{lowest[name, s][0]:.3f} to {lowest[name, s][1]:.3f}"
             for s in findings.sites

@@ -5,7 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.report.answer import false_passes, name_of
+from dcvrt.studies.report.answer import false_passes
+from dcvrt.studies.report.caveats import name_of, why_it_never_falls
 from dcvrt.studies.report.page import Safe, paragraph, section, table
 from dcvrt.studies.rows import Row, by_site, verdict
 from dcvrt.studies.style import mode_name
@@ -41,7 +42,9 @@ def hypotheses(findings: Findings) -> Safe:
 
 def _never_falls(findings: Findings) -> tuple[str, str]:
     falls = findings.falls()
-    return (FAILS, " ".join(falls)) if falls else (HOLDS, "In every mode and with every method.")
+    if falls:
+        return FAILS, " ".join(falls)
+    return HOLDS, f"In every mode and with every method ({why_it_never_falls(findings)})."
 
 
 def _restored(findings: Findings) -> tuple[str, str]:
@@ -119,6 +122,8 @@ def _single_sites_fall(findings: Findings) -> tuple[str, str]:
 
 
 def _no_false_pass(findings: Findings) -> tuple[str, str]:
+    if findings.predictions.empty:
+        return OPEN, "No fit has a validation point."
     count = sum(false_passes(findings).values())
     evidence = f"{count} false passes among {len(findings.predictions)} validation points."
     return (FAILS if count else HOLDS), evidence

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from dcvrt.dae import Row as ParameterRow
 from dcvrt.studies.figures.internal_response import on_test_waveform
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
+from dcvrt.studies.report.what_if import reference
 from dcvrt.studies.style import mode_name
 
 
@@ -90,6 +93,8 @@ def assumptions(findings: Findings) -> Safe:
             if differing
             else paragraph("No parameter that the modes share differs between them.")
         )
+        if differing:
+            parts.append(reference(findings, [str(row[0]) for row in differing]))
     changed = sorted(
         {
             (path, mode_name(mode), value)
@@ -106,11 +111,12 @@ def assumptions(findings: Findings) -> Safe:
                 words=[1],
             )
         )
+    given = _set_by_the_study(findings)
     tables = [
         table(
             f"Parameters of the {mode_name(mode)} facility",
             ["parameter", "value", "unit", "meaning", "source"],
-            [_parameter(row) for row in findings.facility(mode).parameters],
+            [_parameter(row, given) for row in findings.facility(mode).parameters],
             words=[2, 3, 4],
         )
         for mode in findings.modes
@@ -119,7 +125,7 @@ def assumptions(findings: Findings) -> Safe:
         f"{mode_name(mode)}: {sum('illustrative' in row.source for row in rows)} of {len(rows)} parameters "
         "are illustrative"
         for mode in findings.modes
-        for rows in [findings.facility(mode).parameters]
+        for rows in [[row for row in findings.facility(mode).parameters if row.path not in given]]
     ]
     parts.append(
         Safe(
@@ -130,8 +136,26 @@ def assumptions(findings: Findings) -> Safe:
     return section("Assumptions", *parts)
 
 
-def _parameter(row: ParameterRow) -> list[object]:
+def _parameter(row: ParameterRow, given: Mapping[str, str]) -> list[object]:
+    if row.path in given:
+        return [row.path, given[row.path], row.unit, row.doc, "set by the study"]
     return [row.path, f"{row.value:g}", row.unit, row.doc, row.source or "not stated"]
+
+
+def _set_by_the_study(findings: Findings) -> dict[str, str]:
+    """Values of the parameters that are not the facility's own: each run has those of its place."""
+    factors = [period["dc_factor"] for period in findings.periods.values()]
+    return {
+        "H": "1, on the base of the site's capacity",
+        "beta": _span(findings.study.facility.beta),
+        "d": _span(factors),
+        "pf": f"{findings.study.hosting.pf:g}",
+    }
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = f"{min(values):g}", f"{max(values):g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _differing(findings: Findings) -> list[list[object]]:

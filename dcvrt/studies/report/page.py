@@ -36,6 +36,17 @@ def number(value: float | None, digits: int = 1, missing: str = "–") -> str:
     return text[1:] if text.startswith("-") and float(text) == 0.0 else text
 
 
+def magnitude(value: float | None, missing: str = "–") -> str:
+    """A number that may be tiny, with its power of ten; a dash where there is none.
+
+    >>> magnitude(2.58e-9), magnitude(0.0), magnitude(None), magnitude(float("nan"))
+    ('2.6e-09', '0', '–', '–')
+    """
+    if value is None or value != value:
+        return missing
+    return "0" if value == 0 else f"{value:.1e}"
+
+
 def paragraph(text: object, kind: str = "") -> Safe:
     """A paragraph, with a class when `kind` is given."""
     return Safe(f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>")

@@ -3,8 +3,20 @@
 from __future__ import annotations
 
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.report.answer import name_of
-from dcvrt.studies.report.page import Safe, badge, escape, figure, number, paragraph, section, table
+from dcvrt.studies.report import caveats
+from dcvrt.studies.report.caveats import name_of
+from dcvrt.studies.report.page import (
+    Safe,
+    badge,
+    bullets,
+    escape,
+    figure,
+    magnitude,
+    number,
+    paragraph,
+    section,
+    table,
+)
 from dcvrt.studies.rows import Row, ac_verdict, binding, binding_text, by_site, carried, closed, verdict
 from dcvrt.studies.style import mode_name
 
@@ -70,6 +82,8 @@ def plans(findings: Findings) -> Safe:
         "AC power flow",
         "lowest voltage (pu)",
         "error of the linear screen (pu)",
+        "units beyond reactive limits, worst hour",
+        "largest excess (Mvar)",
     ]
     checks: list[list[object]] = [["none required", "–", "–", "–", "–", "–", "–", *_ac_of_no_vrt(findings)]]
     checks += [
@@ -83,7 +97,8 @@ def plans(findings: Findings) -> Safe:
             number(row["replay"]["aggregate_loss_mw"], 2),
             badge(ac_verdict(row)),
             number(row["ac"]["v_min_pu"], 4),
-            number(row["ac"]["v_error_pu"], 5),
+            magnitude(row["ac"]["v_error_pu"]),
+            *_reactive(findings.plan(row)),
         ]
         for row in ordered
     ]
@@ -105,11 +120,13 @@ def plans(findings: Findings) -> Safe:
         ),
     ]
     words = 4 + len(sites)
+    edge, loaded = caveats.lower_bounds(findings), caveats.limited_before_fault(findings)
     return section(
         "Plans",
         *pictures,
         *[paragraph(text) for text in explained],
         paragraph("Prices in brackets are hosted MW gained per unit by which a limit is relaxed."),
+        *([paragraph(caveats.LOWER_BOUNDS), bullets(edge)] if edge else []),
         table(
             "Plans by method, mode and rating",
             head,
@@ -121,14 +138,17 @@ def plans(findings: Findings) -> Safe:
             "The replay simulates every fault in every period with every facility of the plan. A negative "
             "margin is a failure. The aggregate loss is the largest sum of the sites' lost import in one "
             "fault. The AC power flow covers every hour; the error is that of the linear voltage screen "
-            "near a limit."
+            "near a limit. It holds the voltages of the units whatever reactive power that takes; the last "
+            "columns say how far this goes beyond their limits, which are not enforced."
         ),
         table("Checks of each plan", check_head, checks, words=[2, 3, 7], marked=marked),
+        paragraph(loaded[0]),
+        *([bullets(loaded[1:])] if loaded[1:] else []),
     )
 
 
 def _what_binds(row: Row) -> Safe:
-    """Closed sites and the dearest limits, one a line; the row says mode and rating already."""
+    """Closed sites and the highest-priced limits, one a line; the row says mode and rating already."""
     shut = closed(row)
     found = [carried(row)] if carried(row) else []
     found += [f"closed: bus {', '.join(shut)}"] if shut else []
@@ -144,12 +164,19 @@ def _place_in_sweep(row: Row) -> str:
 
 
 def _ac_of_no_vrt(findings: Findings) -> list[object]:
-    plan = findings.plans[findings.plans.method == "none"].iloc[0]
+    plan = caveats.no_vrt(findings)
     return [
-        badge("passed" if plan.ac_passed else "failed"),
-        number(plan.ac_v_min_pu, 4),
-        number(plan.ac_v_error_pu, 5),
+        badge("passed" if plan["ac_passed"] else "failed"),
+        number(plan["ac_v_min_pu"], 4),
+        magnitude(plan["ac_v_error_pu"]),
+        *_reactive(plan),
     ]
+
+
+def _reactive(plan: Row) -> list[object]:
+    """Units beyond their reactive limits at a plan of the store, and by how much."""
+    found = caveats.reactive_excess(plan)
+    return ["–", "–"] if found is None else [str(found.units), number(found.excess_mvar, 1)]
 
 
 def limits_of_no_vrt(findings: Findings) -> Safe:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dcvrt.errors import first_sentence
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
@@ -81,8 +82,7 @@ def simulations(findings: Findings) -> Safe:
 def failed_runs(findings: Findings) -> pd.DataFrame:
     """Rows of margins whose simulation failed, with the first line of what it said as `reason`."""
     failed = findings.margins[findings.margins.failed_in.isin(["grid", "facility"])]
-    reasons = [str(status).splitlines()[0].split(". ")[0].rstrip(".") for status in failed.status]
-    return failed.assign(reason=reasons)
+    return failed.assign(reason=[first_sentence(status) for status in failed.status])
 
 
 def method(findings: Findings) -> Safe:
