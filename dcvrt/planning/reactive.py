@@ -9,7 +9,9 @@ at every bus with units that holds its voltage; Q^d is the demand there, hosted 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,47 +27,68 @@ TOLERANCE_MVAR = 1e-3
 
 
 @dataclass(frozen=True)
-class ReactiveExcess:
-    """Reactive output of the units beyond their limits, over all hours that have a solution.
+class Beyond:
+    """Units beyond one of their two reactive limits, over all hours that have a solution.
 
     Units at one bus share its output: they are beyond together, when the bus is beyond the sum of theirs.
 
     Parameters
     ----------
-    above, below : int
-        Units above q_max and units below q_min in the worst hour, the one with most units beyond.
+    units : int
+        Units beyond in the worst hour, the one with most of them.
     hour : int or None
         The worst hour; None when no unit is beyond in any hour.
-    hours : int
-        Hours with a unit beyond.
     excess_mvar : float
         Largest distance of a bus beyond its limit in any hour.
-    excess_bus, excess_hour : int or None
-        Where and when it is.
+    bus, excess_hour : int or None
+        Where and when that is.
     """
 
-    above: int
-    below: int
-    hour: int | None
-    hours: int
-    excess_mvar: float
-    excess_bus: int | None
-    excess_hour: int | None
+    units: int = 0
+    hour: int | None = None
+    excess_mvar: float = 0.0
+    bus: int | None = None
+    excess_hour: int | None = None
 
-    @property
-    def units(self) -> int:
-        """Units beyond either limit in the worst hour."""
-        return self.above + self.below
+    def text(self, limit: str) -> str:
+        """What is told of it.
+
+        >>> Beyond(3, 17, 12.345, 77, 19).text("above q_max")
+        '3 above q_max (hour 17), by up to 12.3 Mvar (bus 77, hour 19)'
+        >>> Beyond().text("above q_max")
+        'none above q_max'
+        """
+        if not self.units:
+            return f"none {limit}"
+        return (
+            f"{self.units} {limit} (hour {self.hour}), by up to {self.excess_mvar:.1f} Mvar (bus {self.bus}, "
+            f"hour {self.excess_hour})"
+        )
+
+
+@dataclass(frozen=True)
+class ReactiveExcess:
+    """Reactive output of the units beyond their limits.
+
+    Parameters
+    ----------
+    above, below : Beyond
+        Units above q_max, and units below q_min.
+    """
+
+    above: Beyond = Beyond()
+    below: Beyond = Beyond()
+
+    def __bool__(self) -> bool:
+        return bool(self.above.units or self.below.units)
 
     def __str__(self) -> str:
-        if self.hour is None:
-            return "no unit beyond a limit in any hour"
-        kinds = (self.above, "above q_max"), (self.below, "below q_min")
-        counts = " and ".join(f"{count} {kind}" for count, kind in kinds if count)
-        return (
-            f"{counts} in hour {self.hour}, the worst; at most {self.excess_mvar:.4g} Mvar "
-            f"beyond, at bus {self.excess_bus} in hour {self.excess_hour}"
-        )
+        return f"{self.above.text('above q_max')}; {self.below.text('below q_min')}"
+
+    @classmethod
+    def of(cls, sides: Mapping[str, Mapping[str, Any]]) -> ReactiveExcess:
+        """Undo `dataclasses.asdict`."""
+        return cls(Beyond(**sides["above"]), Beyond(**sides["below"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +148,21 @@ def excess(network: Network, buses: UnitBuses, output: Floats, hours: Integers) 
     hours : int array (hours,)
         Names of the hours.
     """
-    over, under = output - buses.high[:, None], buses.low[:, None] - output
-    beyond = np.maximum(over, under)
-    if not beyond.size or beyond.max() <= TOLERANCE_MVAR:
-        return ReactiveExcess(0, 0, None, 0, 0.0, None, None)
-    above, below = (buses.count @ (far > TOLERANCE_MVAR) for far in (over, under))
-    worst = int((above + below).argmax())
-    k, t = np.unravel_index(int(beyond.argmax()), beyond.shape)
-    return ReactiveExcess(
-        int(above[worst]),
-        int(below[worst]),
+    sides = output - buses.high[:, None], buses.low[:, None] - output
+    return ReactiveExcess(*(_beyond(network, buses, far, hours) for far in sides))
+
+
+def _beyond(network: Network, buses: UnitBuses, far: Floats, hours: Integers) -> Beyond:
+    """Count what lies farther than the tolerance beyond a limit, `far` Mvar at each bus and hour."""
+    if not far.size or far.max() <= TOLERANCE_MVAR:
+        return Beyond()
+    units = buses.count @ (far > TOLERANCE_MVAR)
+    worst = int(units.argmax())
+    k, t = np.unravel_index(int(far.argmax()), far.shape)
+    return Beyond(
+        int(units[worst]),
         int(hours[worst]),
-        int((above + below > 0).sum()),
-        float(beyond[k, t]),
+        float(far[k, t]),
         int(network.bus[buses.at[k]]),
         int(hours[t]),
     )

@@ -184,10 +184,10 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
             f"{size[row, k]:.5f} pu at bus {bus} in hour {hour}."
         )
     reactive, unhosted = problem.ac.reactive_excess(H, solved.v[:, good], good), problem.ac.reactive_unhosted
-    if reactive.units or unhosted.units:
+    if reactive or unhosted:
         status += (
-            f" Units beyond their reactive limits, which are not enforced: {reactive}. With nothing hosted: "
-            f"{unhosted}."
+            " Units beyond their reactive limits in the worst hours (the limits are not enforced): "
+            f"{reactive}. With nothing hosted: {unhosted}."
         )
     return AcVerdict(
         inside and bool(solved.converged.all()),

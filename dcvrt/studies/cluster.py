@@ -68,7 +68,7 @@ class Cluster:
                     n_workers=self.workers,
                     threads_per_worker=1,
                     processes=True,
-                    dashboard_address=None,
+                    dashboard_address=":0",  # any free port: two studies may run side by side
                     silence_logs=logging.CRITICAL,
                 )
             self._client = Client(self._cluster)

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from dcvrt.planning.reactive import ReactiveExcess
+from dcvrt.planning.reactive import Beyond, ReactiveExcess
 from dcvrt.studies import outputs, phases
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report import answer, caveats, hypotheses, plans
 from dcvrt.studies.store import Store, records
 from tests.studies.synthetic import CORNER, PERIODS, SITES, make, study_file
 
-HOSTED = ReactiveExcess(3, 2, 17, 40, 12.5, 77, 19)
-UNHOSTED = ReactiveExcess(1, 2, 18, 30, 10.25, 34, 20)
+HOSTED = ReactiveExcess(Beyond(3, 17, 12.5, 77, 19), Beyond(2, 18, 11.5, 34, 20))
+UNHOSTED = ReactiveExcess(Beyond(), Beyond(4, 18, 10.2, 34, 20))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -60,21 +60,22 @@ def test_units_beyond_reactive_limits_are_in_the_answer_and_in_the_checks(folder
     assert best is not None
     assert "Reactive limits of the units are not enforced" in text
     assert (
-        f"At the largest plan ({caveats.name_of(best)}) 5 units are beyond their limits in the worst hour: 3 "
-        "above q_max and 2 below q_min in hour 17, the worst; at most 12.5 Mvar beyond, at bus 77 in hour 19."
+        f"Units beyond their limits at the largest plan ({caveats.name_of(best)}), in the worst hours: 3 "
+        "above q_max (hour 17), by up to 12.5 Mvar (bus 77, hour 19); 2 below q_min (hour 18), by up to 11.5 "
+        "Mvar (bus 34, hour 20)."
     ) in text
     assert (
-        "With nothing hosted 3 units are: 1 above q_max and 2 below q_min in hour 18, the worst; at most "
-        "10.25 Mvar beyond, at bus 34 in hour 20. The difference is due to the hosted load."
+        "The same with nothing hosted: none above q_max; 4 below q_min (hour 18), by up to 10.2 Mvar (bus "
+        "34, hour 20). The difference is due to the hosted load."
     ) in text
     checks = plans.plans(findings)
     checks = checks[checks.index("<caption>Checks of each plan") :]
-    assert checks.count(">5</td>") == checks.count(">12.5</td>") == len(findings.rows()) + 1
+    assert checks.count(">12.5</td>") == checks.count(">11.5</td>") == len(findings.rows()) + 1
 
 
 def test_nothing_is_said_where_no_unit_is_beyond_or_the_store_does_not_say(folder: Path) -> None:
     assert caveats.reactive_limits(Findings(folder)) == []
-    nowhere = asdict(ReactiveExcess(0, 0, None, 0, 0.0, None, None))
+    nowhere = asdict(ReactiveExcess())
     findings = change(folder, worst={"reactive": {"plan": nowhere, "unhosted": nowhere}})
     assert caveats.reactive_limits(findings) == []
     assert "Reactive limits" not in answer.answer(findings)

@@ -30,7 +30,7 @@ def reactive_excess(plan: Row, where: str = "plan") -> ReactiveExcess | None:
     None when the store does not say, as the power flow failed or the study was made before it was recorded.
     """
     found = plan["worst"].get(REACTIVE, {}).get(where)
-    return None if found is None else ReactiveExcess(**found)
+    return None if found is None else ReactiveExcess.of(found)
 
 
 def no_vrt(findings: Findings) -> Row:
@@ -50,12 +50,11 @@ def reactive_limits(findings: Findings) -> list[str]:
     else:
         plan, name = findings.plan(best), f"the largest plan ({name_of(best)})"
     hosted, unhosted = reactive_excess(plan), reactive_excess(plan, "unhosted")
-    if hosted is None or unhosted is None or not (hosted.units or unhosted.units):
+    if hosted is None or unhosted is None or not (hosted or unhosted):
         return []
     return [
-        f"At {name} {hosted.units} units are beyond their limits in the worst hour: {hosted}.",
-        f"With nothing hosted {unhosted.units} units are: {unhosted}. The difference is due to the hosted "
-        "load.",
+        f"Units beyond their limits at {name}, in the worst hours: {hosted}.",
+        f"The same with nothing hosted: {unhosted}. The difference is due to the hosted load.",
         "A passed AC power flow is a verdict on voltages that rest on this reactive power; with the limits "
         "enforced, buses would leave their set points and the capacities would change.",
     ]
@@ -92,7 +91,8 @@ def _sizes(rows: list[Row], bus: int) -> str:
 
 LOWER_BOUNDS = (
     "Plans stay inside the region that was sampled. Where its edge binds, the capacity is a lower bound: how "
-    "much more would ride through is not known. A larger sampling.h_max_mw in the study file tells."
+    "much more would ride through, up to the capacity without ride-through, is not known. A "
+    "larger sampling.h_max_mw in the study file tells."
 )
 
 

@@ -82,7 +82,9 @@ def plans(findings: Findings) -> Safe:
         "AC power flow",
         "lowest voltage (pu)",
         "error of the linear screen (pu)",
-        "units beyond reactive limits, worst hour",
+        "units above q_max, worst hour",
+        "largest excess (Mvar)",
+        "units below q_min, worst hour",
         "largest excess (Mvar)",
     ]
     checks: list[list[object]] = [["none required", "–", "–", "–", "–", "–", "–", *_ac_of_no_vrt(findings)]]
@@ -176,7 +178,10 @@ def _ac_of_no_vrt(findings: Findings) -> list[object]:
 def _reactive(plan: Row) -> list[object]:
     """Units beyond their reactive limits at a plan of the store, and by how much."""
     found = caveats.reactive_excess(plan)
-    return ["–", "–"] if found is None else [str(found.units), number(found.excess_mvar, 1)]
+    if found is None:
+        return ["–"] * 4
+    sides = (found.above, found.below)
+    return [text for side in sides for text in (str(side.units), number(side.excess_mvar, 1))]
 
 
 def limits_of_no_vrt(findings: Findings) -> Safe:
