@@ -1,18 +1,21 @@
-"""Command line of the benchmarks: ``python -m benchmarks NAME [--smoke] [--json FILE]``."""
+"""Command line of the benchmarks: ``python -m benchmarks NAME [--smoke] [--json FILE] [--plot DIR]``."""
 
 from __future__ import annotations
 
 import argparse
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
-from benchmarks.harness import table, write_json
+from benchmarks.harness import pin, table, write_json
 
-NOT_BENCHMARKS = {"__init__", "__main__", "harness"}
+NOT_BENCHMARKS = {"harness"}
 
 
 def names() -> list[str]:
-    return sorted(p.stem for p in Path(__file__).parent.glob("*.py") if p.stem not in NOT_BENCHMARKS)
+    """Modules of this folder that are benchmarks; a leading underscore says that one is not."""
+    found = (p.stem for p in Path(__file__).parent.glob("*.py") if not p.stem.startswith("_"))
+    return sorted(set(found) - NOT_BENCHMARKS)
 
 
 def main() -> None:
@@ -20,8 +23,16 @@ def main() -> None:
     parser.add_argument("name", choices=names(), help="which benchmark")
     parser.add_argument("--smoke", action="store_true", help="smallest case: that it runs, no timing claims")
     parser.add_argument("--json", metavar="FILE", help="store the rows as JSON")
+    parser.add_argument("--plot", metavar="DIR", help="draw work-precision curves into this folder")
     chosen = parser.parse_args()
-    rows = import_module(f"benchmarks.{chosen.name}").run(smoke=chosen.smoke)
+    run = import_module(f"benchmarks.{chosen.name}").run
+    more = {}
+    if chosen.plot:
+        if "plot" not in signature(run).parameters:
+            parser.error(f"{chosen.name} draws nothing: leave --plot out.")
+        more = {"plot": Path(chosen.plot)}
+    print(f"{chosen.name}: {pin()}", flush=True)
+    rows = run(smoke=chosen.smoke, **more)
     print(table(rows))
     if chosen.json:
         write_json(rows, chosen.json)

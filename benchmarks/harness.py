@@ -1,12 +1,14 @@
 """What every benchmark shares: the row it reports, the clock it uses, and how rows are printed and stored.
 
-A benchmark is a module of this package with one function ``run(smoke: bool) -> list[Result]``. Ratios are
-quoted, absolute times are not: they belong to the machine.
+A benchmark is a module of this package with one function ``run(smoke) -> list[Result]``, or
+``run(smoke, plot)`` when it also draws. Ratios are quoted, absolute times are not: they belong to the
+machine.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +20,7 @@ class Result(TypedDict):
 
     case: str
     metric: str
-    value: float
+    value: float | None
     unit: str
     baseline: str
     baseline_value: float | None
@@ -29,14 +31,14 @@ class Result(TypedDict):
 def result(
     case: str,
     metric: str,
-    value: float,
+    value: float | None,
     unit: str,
     baseline: str = "",
     baseline_value: float | None = None,
     error: float | None = None,
 ) -> Result:
     """Make a row; the ratio follows from the two values."""
-    ratio = baseline_value / value if baseline_value is not None and value > 0 else None
+    ratio = baseline_value / value if baseline_value is not None and value else None
     return Result(
         case=case,
         metric=metric,
@@ -47,6 +49,15 @@ def result(
         ratio=ratio,
         error=error,
     )
+
+
+def pin() -> str:
+    """Keep this process on one processor, where the system allows it; says what was done."""
+    if not hasattr(os, "sched_setaffinity"):
+        return "one thread (this system pins no process to a processor)"
+    processor = max(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {processor})
+    return f"one thread on processor {processor}"
 
 
 def seconds(call: Callable[[], Any], repeats: int = 5) -> float:
@@ -61,6 +72,21 @@ def seconds(call: Callable[[], Any], repeats: int = 5) -> float:
         call()
         best = min(best, time.process_time() - start)
     return best
+
+
+def least(call: Callable[[], Any], budget: float = 0.5, most: int = 15) -> float:
+    """Least processor time of a call, s: as many repetitions as a time of `budget` s holds, 2 to `most`."""
+    start = time.process_time()
+    call()
+    first = time.process_time() - start
+    if first > budget:  # nothing to warm that would show
+        start = time.process_time()
+        call()
+        return min(first, time.process_time() - start)
+    start = time.process_time()
+    call()
+    once = time.process_time() - start
+    return min(once, seconds(call, max(2, min(most, int(budget / max(once, 1e-6))))))
 
 
 def table(rows: Sequence[Result]) -> str:

@@ -1,19 +1,22 @@
 """The command line. What is heavy is imported inside the commands, so that `dcvrt --help` answers at once.
 
-Exit codes: 0 done; 1 internal error; 2 bad input; 3 the question has no answer (infeasible); 4 incomplete:
-something was set aside or did not reach its end.
+Exit codes: 0 done; 1 internal error; 2 bad input; 3 the answer is no: nothing meets the limits (infeasible),
+or a facility fails its envelope; 4 incomplete: something was set aside or did not reach its end.
 """
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dcvrt import __version__
+from dcvrt import __version__, envelopes, scenarios
 from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 OK, INTERNAL, BAD_INPUT, INFEASIBLE, INCOMPLETE = range(5)
 
@@ -30,9 +33,6 @@ study = typer.Typer(
 facility = typer.Typer(no_args_is_help=True, help="The facility variants: what they are made of.")
 app.add_typer(study, name="study")
 app.add_typer(facility, name="facility")
-
-TEST_WAVEFORMS = ("ercot-style", "sag-30", "sag-50", "sag-70", "sag-85")
-"""Waveforms that can be named instead of a file; sag-NN leaves NN % for 150 ms."""
 
 
 @app.callback(invoke_without_command=True)
@@ -124,7 +124,6 @@ def study_schema() -> None:
 def _show(result: object) -> None:
     """Print the table of plans and where the rest is; say what is missing and end with code 4 if anything
     is."""
-    from rich.console import Console
     from rich.table import Table
 
     from dcvrt.studies.store import records
@@ -150,9 +149,7 @@ def _show(result: object) -> None:
             _number(row["worst_loss_margin_mw"], ".2f"),
             row["ac"],
         )
-    console = Console()
-    if not sys.stdout.isatty():
-        console.width = 140
+    console = _console()
     console.print(shown)
     counts = result.summary["simulations"]
     console.print(
@@ -171,6 +168,16 @@ def _show(result: object) -> None:
         raise typer.Exit(INCOMPLETE)
 
 
+def _console(width: int = 140) -> Console:
+    """Where tables go; as wide as they need when nobody watches."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not sys.stdout.isatty():
+        console.width = width
+    return console
+
+
 def _number(value: object, form: str) -> str:
     return "" if value is None or value != value else format(value, form)
 
@@ -182,37 +189,123 @@ def _number(value: object, form: str) -> str:
 def ride(
     variant: Annotated[str, typer.Argument(help="Facility variant; 'dcvrt facility list' shows them.")],
     waveform: Annotated[
-        str, typer.Option(help=f"CSV file with columns t and v, or one of {', '.join(TEST_WAVEFORMS)}.")
-    ],
+        str | None,
+        typer.Option(help=f"CSV file with columns t and v, or one of {', '.join(scenarios.names())}."),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Instead of a waveform, every item of an envelope: {', '.join(envelopes.names())}."
+        ),
+    ] = None,
     beta: Annotated[float, typer.Option(help="Converter rating over hosted capacity.")] = 1.15,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Another parameter, as sup.T_dip=2.5; repeatable."),
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the signals (CSV) and their picture (SVG).")
+        Path | None,
+        typer.Option(help="Folder for signals (CSV), pictures and, of an envelope, verdicts (CSV)."),
     ] = None,
 ) -> None:
-    """Run one facility on one waveform: margins, events, signals."""
-    from dcvrt.studies.single import ride as run_one
+    """Run one facility on one waveform, or against the ride-through envelope of a code.
 
-    text, complete = run_one(variant, waveform, beta, out, TEST_WAVEFORMS)
-    print(text)
-    if not complete:
-        raise typer.Exit(INCOMPLETE)
+    Exit codes: 0 done, and every item of an envelope passed; 2 bad input;
+
+    3 the facility fails an item of the envelope; 4 a run did not reach its end.
+    """
+    from dcvrt.studies.single import parameters_of
+
+    if (waveform is None) == (against is None):
+        how = "neither is there" if waveform is None else "both are there"
+        raise InputError(
+            f"ride needs either --waveform or --against; {how}. Way out: --waveform for one course of the "
+            "voltage, --against for every item of a code."
+        )
+    parameters = parameters_of(beta, settings or [])
+    if waveform is not None:
+        from dcvrt.studies.single import ride as run_one
+
+        text, complete = run_one(variant, waveform, parameters, out)
+        print(text)
+        if not complete:
+            raise typer.Exit(INCOMPLETE)
+    elif against is not None:
+        _against(variant, envelopes.get(against), parameters, out)
+
+
+def _against(
+    variant: str, envelope: envelopes.Envelope, parameters: dict[str, float], out: Path | None
+) -> None:
+    from dcvrt.studies import against as judge
+
+    outcomes, written = judge.against(variant, envelope, parameters, out)
+    print(judge.header(variant, envelope, parameters))
+    _console(160).print(judge.table_of(outcomes))
+    print(judge.footer(envelope, outcomes))
+    for path in written[:3]:
+        print(path)
+    if len(written) > 3:
+        print(f"{written[3].parent}: {len(written) - 3} tables of signals")
+    passed = judge.overall(outcomes)
+    if passed is not True:
+        raise typer.Exit(INFEASIBLE if passed is False else INCOMPLETE)
 
 
 @facility.command("list")
 def facility_list() -> None:
-    """List the shipped variants."""
+    """List the shipped variants: name, what it is, number of states, modes of its automata."""
+    from rich import box
+    from rich.table import Table
+
     from dcvrt import facility as variants
 
+    shown = Table("name", "what it is", "states", "modes", box=box.SIMPLE_HEAD, show_edge=False)
     for name in variants.names():
-        print(f"{name:20} {variants.get(name).doc}")
+        diagram = variants.get(name)
+        dae = diagram.compile()
+        modes = "\n".join(f"{a.path}: {' '.join(a.modes)}" for a in dae.automata)
+        shown.add_row(name, diagram.doc, str(len(dae.states)), modes)
+    shown.columns[0].no_wrap = True
+    _console().print(shown)
 
 
 @facility.command("sheet")
-def facility_sheet(variant: Annotated[str, typer.Argument(help="Facility variant.")]) -> None:
-    """Print equations, parameters, ports and modes of a variant (Markdown)."""
+def facility_sheet(
+    variant: Annotated[str, typer.Argument(help="Facility variant; 'dcvrt facility list' shows them.")],
+    markdown: Annotated[bool, typer.Option("--markdown", help="Markdown, as into a file.")] = False,
+    latex: Annotated[bool, typer.Option("--latex", help="A LaTeX document.")] = False,
+) -> None:
+    """Show what a variant is made of: equations, parameters, ports, modes. Markdown when piped."""
     from dcvrt import facility as variants
 
-    print(variants.get(variant).sheet())
+    if markdown and latex:
+        raise InputError("--markdown and --latex exclude each other. Way out: one of the two.")
+    diagram = variants.get(variant)
+    if latex or markdown or not sys.stdout.isatty():
+        print(diagram.sheet("latex" if latex else "markdown"), end="")
+        return
+    from dcvrt.models.sheet import contents
+    from dcvrt.models.sheet_forms import terminal
+
+    console = _console()
+    for part in terminal(contents(diagram)):
+        console.print(part)
+
+
+@facility.command("export")
+def facility_export(
+    variant: Annotated[str, typer.Argument(help="Facility variant; 'dcvrt facility list' shows them.")],
+    fmu: Annotated[Path, typer.Option(help="File to write, *.fmu.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of this name.")] = False,
+) -> None:
+    """Write a variant as an FMU (FMI 3.0, model exchange) for other simulation tools."""
+    from dcvrt import facility as variants
+    from dcvrt.fmi import export
+
+    diagram = variants.get(variant)
+    path = export(diagram.compile(), fmu, overwrite=overwrite, doc=diagram.doc, sheet=diagram.sheet())
+    print(f"{path}: {variant} as FMI 3.0 model exchange; documentation/index.html inside tells how to use it")
 
 
 # -- the machine ---------------------------------------------------------------------------------------------

@@ -17,12 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from dcvrt.errors import InputError, did_you_mean, outside
+
+if TYPE_CHECKING:
+    from dcvrt.linear import Linear, OperatingPoint
 
 Array = NDArray[np.float64]
 
@@ -64,6 +69,24 @@ class Transition:
 
 
 @dataclass(frozen=True)
+class Gap:
+    """Two rows that lead back and forth between two modes: while their limits overlap, the modes chatter.
+
+    One for every combination of the alternatives in the two guards.
+
+    Attributes
+    ----------
+    rows : texts of the two rows.
+    width : SX expression of the parameters; the limits are apart while it is positive.
+    limits : name and SX expression of the limits that are compared.
+    """
+
+    rows: tuple[str, str]
+    width: ca.SX
+    limits: tuple[tuple[str, ca.SX], ...]
+
+
+@dataclass(frozen=True)
 class Automaton:
     """Modes, the flags each mode sets, and the rows that lead from one to another, tried top to bottom.
 
@@ -75,6 +98,7 @@ class Automaton:
     flags : array (modes, flags): value of `q` in each mode.
     clock : SX symbol, time since the current mode was entered.
     rows : transitions in order.
+    gaps : pairs of rows whose limits must be apart, whatever the parameters are set to.
     """
 
     path: str
@@ -85,6 +109,7 @@ class Automaton:
     flags: Array
     clock: ca.SX
     rows: tuple[Transition, ...]
+    gaps: tuple[Gap, ...] = ()
 
     def mode_number(self, mode: str) -> int:
         """Position of `mode` in `modes`."""
@@ -159,6 +184,23 @@ class Dae:
     def y_names(self) -> tuple[str, ...]:
         return tuple(r.path for r in self.outputs)
 
+    def automaton_behind(self, output: str) -> Automaton:
+        """The automaton whose flags an output shows, as `mode` does.
+
+        Raises
+        ------
+        InputError
+            no such output, or one that does not show exactly one automaton.
+        """
+        if output not in self.y_names:
+            raise InputError(f"{self.name} has no output {output!r}.{did_you_mean(output, self.y_names)}")
+        signal = self.y[self.y_names.index(output)]
+        shown = [a for a in self.automata if a.q.numel() and ca.depends_on(signal, a.q)]
+        if len(shown) != 1:
+            found = ", ".join(a.path for a in shown) or "none"
+            raise InputError(f"{self.name}: output {output!r} must show one automaton; it shows {found}.")
+        return shown[0]
+
     def parameter_number(self, path: str) -> int:
         """Position of the parameter `path` in `p`."""
         if path not in self.p_names:
@@ -173,7 +215,8 @@ class Dae:
         Raises
         ------
         InputError
-            unknown names and values outside their bounds, all at once.
+            unknown names and values outside their bounds, all at once; limits of guards that would leave no
+            hysteresis between two modes.
         """
         values = np.array([r.value for r in self.parameter_rows], dtype=float)
         problems = []
@@ -187,9 +230,62 @@ class Dae:
                 problems.append(outside(path, value, row.unit, row.bounds))
                 continue
             values[self.p_names.index(path)] = value
+        if changes and not problems:
+            problems = [f"{self.name}: {problem}" for problem in self.chatter(values)]
         if problems:
             raise InputError("\n".join(problems))
         return values
+
+    def linearise(self, at: OperatingPoint) -> Linear:
+        """The linear system for small disturbances about a point, algebraic variables eliminated.
+
+        Parameters
+        ----------
+        at : from ``Simulator(dae).equilibrium(...)``, or :func:`dcvrt.linear.operating_point`.
+
+        Raises
+        ------
+        InputError
+            the point belongs to another system.
+        ModelError
+            the algebraic equations are singular at the point, or a derivative is not finite.
+        """
+        from dcvrt.linear import linearise
+
+        return linearise(self, at)
+
+    def chatter(self, values: Array) -> list[str]:
+        """Pairs of rows between which the parameter values leave no hysteresis, one message each."""
+        problems = []
+        numbers = iter(np.array(self._gaps(values)).ravel() if self.automata else ())
+        for a in self.automata:
+            for gap in a.gaps:
+                width, limits = next(numbers), [(name, next(numbers)) for name, _ in gap.limits]
+                if not width > 0:
+                    named = [(name, value) for name, value in limits if not _is_number(name)]
+                    now = ", ".join(f"{name} = {value:g}" for name, value in named or [("gap", width)])
+                    problems.append(
+                        f"{a.path}: '{gap.rows[0]}' and '{gap.rows[1]}' leave no gap between them ({now}): "
+                        "the modes would chatter. Set the limit of the way back beyond that of the way out."
+                    )
+        return problems
+
+    @cached_property
+    def _gaps(self) -> ca.Function:
+        """Width and limits of every gap as a function of the parameters."""
+        rows = [
+            e for a in self.automata for g in a.gaps for e in (g.width, *(limit for _, limit in g.limits))
+        ]
+        return ca.Function("gaps", [self.p], [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
+
+
+def _is_number(text: str) -> bool:
+    """Whether a limit is written as a number, which says its own value."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 class ParameterTable(tuple[Row, ...]):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +43,12 @@ class Event:
         return f"{self.time:.6f} s  {self.automaton}: {self.source} -> {self.target}  [{self.row}]{tie}"
 
 
+class Pullback(Protocol):
+    """What an adjoint run can say: the derivative by every theta of a form in derivatives of its samples."""
+
+    def gradient(self, slope: object, sign: float = 1.0) -> Mapping[str, float]: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Signals:
     """Named columns over time; the last axis of `sens` and `rate_sens` is theta.
@@ -72,6 +78,11 @@ class Sensitivities:
                 f"{theta!r} is not among the wrt of this simulator.{did_you_mean(theta, self._run.wrt)}"
             )
         signals, k = self._run._find(signal)
+        if self._run.adjoint is not None:
+            raise InputError(
+                f"sens[{signal!r}, {theta!r}]: an adjoint run has gradients of functionals, no sensitivities "
+                f"over time. Ways out: Minimum({signal!r}).of(run).grad, margins(run); or mode='forward'."
+            )
         assert signals.sens is not None
         return signals.sens[:, k, self._run.wrt.index(theta)]
 
@@ -92,6 +103,7 @@ class Trajectory:
     wrt : names of the thetas.
     start_modes : mode of every automaton at the start.
     break_grad : derivative of the times that stand twice by every theta, in their order (0 at input jumps).
+    adjoint : of a run with mode="adjoint": gives gradients in place of sensitivities.
     """
 
     t: Array
@@ -105,6 +117,7 @@ class Trajectory:
     start_modes: Mapping[str, str]
     break_grad: Array
     name: str = ""
+    adjoint: Pullback | None = None
 
     @property
     def completed(self) -> bool:
@@ -131,6 +144,12 @@ class Trajectory:
         """Modes visited with the rows that led there: the label under which margins may be compared."""
         begin = tuple(f"{path}: {mode}" for path, mode in self.start_modes.items())
         return begin + tuple(f"{e.automaton}: {e.source} -> {e.target} [{e.row}]" for e in self.events)
+
+    def gradient(self, slope: Array, sign: float = 1.0) -> Mapping[str, float]:
+        """Derivatives by name from the one entry per theta that a functional found."""
+        if self.adjoint is not None:
+            return self.adjoint.gradient(slope[0], sign)
+        return {theta: float(sign * g) for theta, g in zip(self.wrt, slope, strict=True)}
 
     def __getitem__(self, name: str) -> Array:
         signals, k = self._find(name)

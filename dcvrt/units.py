@@ -19,6 +19,7 @@ BASES = {
     "rad": "radian",
     "deg": "degree of angle",
     "Hz": "hertz",
+    "K": "kelvin: a difference of temperature",
     "pu(V)": "voltage over its base",
     "pu(I)": "current over its base",
     "pu(S)": "power, active, reactive or apparent, over S_B",
@@ -72,7 +73,45 @@ def dimension(unit: str) -> Dimension:
 def same_unit(one: str, other: str) -> bool:
     """Whether two units are the same product of the same bases.
 
+    The bases of power and impedance follow from those of voltage and current, S = V I and Z = V/I.
+
     >>> same_unit("pu(S)/s", "pu(S) s-1"), same_unit("pu(V)", "pu(I)")
     (True, False)
+    >>> same_unit("pu(V)/pu(I)", "pu(Z)"), same_unit("pu(S)/pu(V)", "pu(I)")
+    (True, True)
     """
-    return dimension(one) == dimension(other)
+    return reduced(dimension(one)) == reduced(dimension(other))
+
+
+def product(*factors: tuple[Dimension, int]) -> Dimension:
+    """Product of dimensions, each to a power.
+
+    >>> product((dimension("pu(V)"), 2), (dimension("s"), -1))
+    (('pu(V)', 2), ('s', -1))
+    """
+    powers: dict[str, int] = {}
+    for factor, exponent in factors:
+        for base, power in factor:
+            powers[base] = powers.get(base, 0) + power * exponent
+    return tuple(sorted((base, power) for base, power in powers.items() if power))
+
+
+def reduced(given: Dimension) -> Dimension:
+    """The dimension with power and impedance written in voltage and current."""
+    powers = dict(given)
+    s, z = powers.pop("pu(S)", 0), powers.pop("pu(Z)", 0)
+    return product((tuple(powers.items()), 1), ((("pu(I)", s - z), ("pu(V)", s + z)), 1))
+
+
+def unit_text(given: Dimension) -> str:
+    """The unit that has this dimension.
+
+    >>> unit_text(dimension("rad/s2/pu(V)")), unit_text(())
+    ('rad/pu(V)/s2', '1')
+    """
+
+    def power(base: str, exponent: int) -> str:
+        return base if exponent == 1 else f"{base}{exponent}"
+
+    over = " ".join(power(base, n) for base, n in given if n > 0) or "1"
+    return over + "".join(f"/{power(base, -n)}" for base, n in given if n < 0)

@@ -27,124 +27,22 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dcvrt.delimited import read_table
 from dcvrt.errors import InputError, did_you_mean, raise_all
+from dcvrt.samples import Pieces, check_samples, cubic_pieces, negative, spans_of_steps
+from dcvrt.waveform_tables import TIME_NAMES, column, columns, voltage
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Segment = tuple[float, complex] | tuple[float, complex, complex]
 
-TIME_NAMES = ("t", "time", "t_s", "time_s", "seconds")
-MAGNITUDE_NAMES = ("v", "vm", "v_mag", "v_pu", "v_poi", "v_poi_pu", "magnitude", "voltage")
-ANGLE_NAMES = ("angle", "angle_deg", "v_angle", "v_angle_deg", "v_deg")
 HIGHEST = 3.0
 """Voltage magnitude, pu, above which a waveform is taken to be in volts or kilovolts by mistake."""
-PHASE_NAMES = (("v_a", "v_b", "v_c"), ("va", "vb", "vc"), ("v_l1", "v_l2", "v_l3"), ("l1", "l2", "l3"))
-
-
-@dataclass(frozen=True, eq=False)
-class Pieces:
-    """Piecewise cubic: value = sum_j coefficients[k, j] * s**j with s = (t - start[k]) / length[k] in [0, 1].
-
-    `after_jump[k]` marks pieces that do not continue the one before them.
-    """
-
-    start: Array
-    length: Array
-    coefficients: NDArray[Any]
-    after_jump: NDArray[np.bool_]
-
-    def at(self, t: ArrayLike) -> NDArray[Any]:
-        """Value at times `t`; at a jump the value after it. Outside the range the end values hold."""
-        t = np.asarray(t, dtype=float)
-        k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
-        s = np.clip((t - self.start[k]) / self.length[k], 0.0, 1.0)
-        c = self.coefficients[k]
-        return c[..., 0] + s * (c[..., 1] + s * (c[..., 2] + s * c[..., 3]))
-
-    def on(self, start: Array, length: Array) -> NDArray[Any]:
-        """Coefficients of the same function on finer pieces, each of which lies in one piece of this."""
-        k = np.clip(np.searchsorted(self.start, start + length / 2, side="right") - 1, 0, len(self.start) - 1)
-        a, h = (start - self.start[k]) / self.length[k], length / self.length[k]
-        c0, c1, c2, c3 = self.coefficients[k].T
-        moved = (
-            c0 + a * (c1 + a * (c2 + a * c3)),
-            h * (c1 + a * (2 * c2 + 3 * a * c3)),
-            h**2 * (c2 + 3 * a * c3),
-            h**3 * c3,
-        )
-        return np.stack(moved, axis=1)
-
-
-def cubic_pieces(t: Array, v: NDArray[Any]) -> Pieces:
-    """Pieces of the C1 cubic through `v` at `t`; a time that stands twice is a jump."""
-    slope = _slopes(t, v)
-    real = np.flatnonzero(np.diff(t) > 0)
-    length = t[real + 1] - t[real]
-    m0, m1, rise = slope[real] * length, slope[real + 1] * length, v[real + 1] - v[real]
-    coefficients = np.stack((v[real], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise), axis=1)
-    after_jump = np.zeros(len(real), dtype=bool)
-    after_jump[1:] = np.diff(real) > 1
-    return Pieces(t[real], length, coefficients, after_jump)
-
-
-def _slopes(t: Array, v: NDArray[Any]) -> NDArray[Any]:
-    """Slope at every sample: of the parabola through three neighbours between jumps."""
-    slope = np.zeros_like(v)
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(t) == 0) + 1, [len(t)]))
-    for a, b in itertools.pairwise(edges):
-        if b - a < 2:
-            continue
-        h = np.diff(t[a:b])
-        secant = np.diff(v[a:b]) / h
-        if b - a == 2:
-            slope[a:b] = secant[0]
-            continue
-        slope[a + 1 : b - 1] = (h[1:] * secant[:-1] + h[:-1] * secant[1:]) / (h[:-1] + h[1:])
-        slope[a] = secant[0] + h[0] * (secant[0] - secant[1]) / (h[0] + h[1])
-        slope[b - 1] = secant[-1] + h[-1] * (secant[-1] - secant[-2]) / (h[-1] + h[-2])
-    return slope
-
-
-def check_samples(t: ArrayLike, v: ArrayLike, what: str) -> list[str]:
-    """Say what is wrong with samples `v` on times `t`: one line a fault, none when they can be used."""
-    t, v = np.asarray(t), np.asarray(v)
-    if t.ndim != 1 or v.shape != t.shape:
-        return [f"t has shape {t.shape} and {what} {v.shape}; both must be one column of the same length."]
-    if len(t) < 2:
-        return [f"{len(t)} sample(s); at least two times are needed."]
-    problems = []
-    for label, values in (("t", t), (what, v)):
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
-            problems.append(f"{label}[{bad[0]}] is {values[bad[0]]}{more}.")
-    step = np.diff(t)
-    back = np.flatnonzero(step < 0)
-    if len(back):
-        k = back[0] + 1
-        problems.append(
-            f"times do not increase: t[{k}] = {t[k]:g} s comes after t[{k - 1}] = {t[k - 1]:g} s."
-        )
-    triple = np.flatnonzero((step[:-1] == 0) & (step[1:] == 0))
-    if len(triple):
-        k = triple[0]
-        problems.append(
-            f"t[{k}] = t[{k + 1}] = t[{k + 2}] = {t[k]:g} s: "
-            "a time may stand twice (a jump), not three times."
-        )
-    if not problems and t[-1] <= t[0]:
-        problems.append(f"it lasts no time: first and last time are {t[0]:g} s.")
-    return problems
-
-
-def negative(magnitudes: ArrayLike, what: str) -> list[str]:
-    """Say which magnitude (a voltage given as a real number) is negative: one line, none when none is."""
-    values = np.asarray(magnitudes)
-    if np.iscomplexobj(values) or not (values < 0).any():
-        return []
-    k = int(np.argmax(values < 0))
-    return [f"{what}[{k}] = {values[k]:g} pu is negative. Write a complex value to turn the phasor."]
+TURN = 0.05
+"""Largest angle, rad, between samples of a rotating phasor: the cubic's magnitude errs by 3/128 of its fourth
+power, its speed ripples by a sixth of its square."""
+BEND = 3e-6
+"""Largest product of speed, acceleration, and cube of the distance between samples: the cubic's magnitude
+errs by about a seventh of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,28 +118,12 @@ class Waveform:
         >>> w.magnitude.tolist()
         [1.0, 1.0, 0.5, 0.5, 0.7, 1.0, 1.0, 1.0]
         """
-        if not steps:
-            raise InputError(
-                "waveform: no segments given; write for example [(0.0, 1.0), (0.1, 0.5), (0.2, 1.0)]."
-            )
-        wrong = [k for k, s in enumerate(steps) if len(s) not in (2, 3)]
-        if wrong:
-            raise InputError(
-                f"waveform: segment {wrong[0]} is {steps[wrong[0]]!r}; write (t, v) or (t, v_from, v_to)."
-            )
-        begins = [float(s[0]) for s in steps]
-        last = begins[-1] + 1.0 if until is None else float(until)
-        ends = [*begins[1:], last]
-        late = [
-            f"segment {k} begins at {a:g} s and ends at {b:g} s; times must increase."
-            for k, (a, b) in enumerate(zip(begins, ends, strict=True))
-            if not b > a
-        ]
-        late += [
+        spans, problems = spans_of_steps(steps, until)
+        problems += [
             problem for k, s in enumerate(steps) for problem in negative(np.array(s[1:]), f"segment {k}")
         ]
-        raise_all(late, "waveform")
-        t = [x for pair in zip(begins, ends, strict=True) for x in pair]
+        raise_all(problems, "waveform")
+        t = [x for span in spans for x in span]
         v = [x for s in steps for x in (complex(s[1]), complex(s[-1]))]
         return cls(np.array(t), np.array(v), name=name)
 
@@ -267,6 +149,49 @@ class Waveform:
         if start + length < until:
             steps.append((start + length, 1.0))
         return cls.segments(steps, until, name=f"sag to {retained:g} pu for {length * 1e3:g} ms")
+
+    @classmethod
+    def rotating(
+        cls,
+        steps: Sequence[tuple[float, float] | tuple[float, float, float]],
+        until: float | None = None,
+        magnitude: float = 1.0,
+        name: str = "rotating phasor",
+    ) -> Waveform:
+        r"""Build a phasor of constant magnitude whose frequency leaves the nominal one.
+
+        .. math::
+            V(t) = |V| \, e^{j \theta(t)}, \qquad \dot\theta = 2 \pi \, \Delta f(t)
+
+        It is sampled so densely that |V(t)| stays within 1e-6 of `magnitude` between the samples too.
+
+        Parameters
+        ----------
+        steps : deviation from the nominal frequency, Hz, as for :meth:`segments`: ``(t, f)`` - from `t` on it
+            is `f` - or ``(t, f_from, f_to)``, a straight ramp. The angle never jumps.
+        until : end of the waveform, s; 1 s after the last entry unless given.
+        magnitude : |V|, pu.
+
+        Examples
+        --------
+        >>> w = Waveform.rotating([(0.0, 0.0), (0.5, 0.0, -1.0), (1.5, -1.0)], until=3.0)
+        >>> abs(w.at(1.5) + 1.0) < 1e-12, abs(w.at(2.0) - 1.0) < 1e-12  # half a turn each
+        (True, True)
+        """
+        spans, problems = spans_of_steps(steps, until)
+        raise_all(problems, "waveform")
+        t, theta, angle = [], [], 0.0
+        for (begin, end), step in zip(spans, steps, strict=True):
+            first, last = 2 * math.pi * float(step[1]), 2 * math.pi * float(step[-1])
+            length, rate = end - begin, (last - first) / (end - begin)
+            fastest = max(abs(first), abs(last))
+            turn = length * max(fastest / TURN, math.cbrt(fastest * abs(rate) / BEND))
+            since = np.linspace(0.0, length, max(2 if turn == 0 else 9, math.ceil(turn) + 1))
+            t.append(begin + since)
+            t[-1][-1] = end
+            theta.append(angle + first * since + 0.5 * rate * since**2)
+            angle = float(theta[-1][-1])
+        return cls(np.concatenate(t), magnitude * np.exp(1j * np.concatenate(theta)), name=name)
 
     @classmethod
     def from_samples(
@@ -322,10 +247,10 @@ class Waveform:
         InputError
             a missing column (with the columns found), a cell that is not a number, unusable samples.
         """
-        table = _columns(Path(path))
+        table = columns(Path(path))
         where = f"{path}: waveform table"
-        t = _column(table, TIME_NAMES, where)
-        v = _voltage(table, phases, where)
+        t = column(table, TIME_NAMES, where)
+        v = voltage(table, phases, where)
         try:
             return cls.from_samples(t, v, jumps=jumps, name=Path(path).stem)
         except InputError as error:
@@ -456,48 +381,3 @@ def _frozen(values: NDArray[Any]) -> NDArray[Any]:
     values = values.copy()
     values.setflags(write=False)
     return values
-
-
-# -- tables -----------------------------------------------------------------------------------------------
-
-
-def _columns(path: Path) -> dict[str, Array]:
-    """Columns of a table with a header by name: lower case, without a unit in brackets."""
-    table = read_table(path)
-    if not table.header:
-        raise InputError(f"{path}: the table has no header; name its columns, for example t,v_re,v_im.")
-    names = [name.split("[")[0].split("(")[0].strip().lower() for name in table.header]
-    return dict(zip(names, table.numbers(range(table.width)).T, strict=True))
-
-
-def _column(table: Mapping[str, Array], names: Sequence[str], where: str) -> Array:
-    for name in names:
-        if name in table:
-            return table[name]
-    raise InputError(
-        f"{where} has no column {names[0]!r} (or {', '.join(names[1:])}). Found: {', '.join(table)}."
-    )
-
-
-def _voltage(table: Mapping[str, Array], phases: str | None, where: str) -> ComplexArray:
-    if "v_re" in table and "v_im" in table:
-        return table["v_re"] + 1j * table["v_im"]
-    for three in PHASE_NAMES:
-        if all(name in table for name in three):
-            if phases not in ("minimum", "mean"):
-                raise InputError(
-                    f"{where} has three phases {', '.join(three)}: say phases='minimum' or phases='mean'; "
-                    "the model is positive-sequence."
-                )
-            stacked = np.stack([table[name] for name in three])
-            return (stacked.min(axis=0) if phases == "minimum" else stacked.mean(axis=0)) + 0j
-    for name in MAGNITUDE_NAMES:
-        if name in table:
-            raise_all(negative(table[name], name), where)
-            angle = next((table[a] for a in ANGLE_NAMES if a in table), None)
-            turn = np.zeros(len(table[name])) if angle is None else np.deg2rad(angle)
-            return np.asarray(table[name] * np.exp(1j * turn), dtype=complex)
-    raise InputError(
-        f"{where} has no voltage column: v_re and v_im, or one of {', '.join(MAGNITUDE_NAMES)} "
-        f"(with angle_deg), or v_a, v_b and v_c. Found: {', '.join(table)}."
-    )

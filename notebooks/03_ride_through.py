@@ -28,8 +28,8 @@ from dcvrt import Criteria, Simulator, Waveform, facility, margins
 
 dae = facility.gfl().compile()
 print(dae.name, "-", len(dae.states), "states,", len(dae.parameters), "parameters")
-print("modes:", ", ".join(dae.automata[0].modes))
-for row in dae.automata[0].rows:
+print("modes:", ", ".join(dae.automaton_behind("mode").modes))
+for row in dae.automaton_behind("mode").rows:
     print("  ", row.text)
 
 # %% [markdown]
@@ -127,13 +127,13 @@ run = Simulator(dae, save_at=2e-3)(profile, beta=1.15)
 with styled():
     figure = ride.draw(
         ride.signals_of(run, profile.at(run.t)),
-        dae.automata[0].modes,
+        dae.automaton_behind("mode").modes,
         "GFL, beta = 1.15, ERCOT-style test waveform (not the official one)",
         criteria.v_it_min,
     )
 figure
 
 # %%
-visited = {dae.automata[0].modes[int(round(k))] for k in run["mode"]}
+visited = {dae.automaton_behind("mode").modes[int(round(k))] for k in run["mode"]}
 print("modes visited:", ", ".join(sorted(visited)))
 assert "BATTERY" in visited, "the deep fault must take the facility off the grid"

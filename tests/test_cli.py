@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -173,11 +174,37 @@ def test_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_facility_list_and_sheet(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("facility", "list") == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()][:2] == ["gfl", "gfm"]
+    head, _, first, second = capsys.readouterr().out.splitlines()[:4]
+    assert head.split() == ["name", "what", "it", "is", "states", "modes"]
+    assert [line.split()[0] for line in (first, second)] == ["gfl", "gfm"]
+    assert first.rstrip().endswith("sup: NORMAL MIXED BATTERY RETURN")
     assert run("facility", "sheet", "gfl") == 0
-    assert "V_dip" in capsys.readouterr().out
+    piped = capsys.readouterr().out
+    assert piped.startswith("# gfl\n")
+    assert "V_dip" in piped
+    assert run("facility", "sheet", "gfl", "--markdown") == 0
+    assert capsys.readouterr().out == piped
+    assert run("facility", "sheet", "gfl", "--latex") == 0
+    assert capsys.readouterr().out.startswith("\\documentclass")
+    assert run("facility", "sheet", "gfl", "--latex", "--markdown") == 2
+    assert capsys.readouterr().err == (
+        "--markdown and --latex exclude each other. Way out: one of the two.\n"
+    )
     assert run("facility", "sheet", "gfx") == 2
     assert capsys.readouterr().err.startswith("there is no facility variant 'gfx'. Did you mean 'gf")
+
+
+def test_a_sheet_in_a_terminal_has_formulas_that_can_be_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run("facility", "sheet", "gfm") == 0
+    said = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert "2 H_v ω̇ = (P^g - P^eff)/H - D (ω - 1)" in said
+    assert "\\frac" not in said
+    assert "$" not in said
+    assert max(len(line) for line in said.splitlines()) <= 100
 
 
 def test_ride_shows_margins_and_events_and_writes_signals(
@@ -228,11 +255,130 @@ def test_ride_refuses_an_unknown_waveform_and_a_rating_out_of_bounds(
 ) -> None:
     assert run("ride", "gfl", "--waveform", "sag-71") == 2
     assert capsys.readouterr().err == (
-        "waveform 'sag-71': no such file and no such test waveform. Did you mean 'sag-70'? "
-        "Known: ercot-style, sag-30, sag-50, sag-70, sag-85.\n"
+        "waveform 'sag-71': no such file and no such scenario. Did you mean 'sag-70'? "
+        "Known: ercot-style, sag-30, sag-50, sag-70, sag-85, six-sags, reclosing, interruption, swell, "
+        "phase-jump, frequency-ramp, frequency-step, ... (14 in all).\n"
     )
     assert run("ride", "gfl", "--waveform", "sag-70", "--beta", "9") == 2
     assert capsys.readouterr().err == "beta = 9 is outside [0.8, 2].\n"
+
+
+def test_ride_takes_scenarios_and_other_parameters(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ride", "gfl", "--waveform", "six-sags", "--set", "sup.T_deep=0.1") == 0
+    said = capsys.readouterr().out
+    assert said.startswith("gfl on 6 sags within 82 s, seed 0, beta 1.15, sup.T_deep 0.1, on the base")
+    assert said.count("NORMAL -> MIXED  [") == 6
+    assert "BATTERY" not in said
+
+
+def test_ride_against_an_envelope_that_is_met_is_code_0(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ride", "gfl", "--against", "spp-hill") == 0
+    said = capsys.readouterr()
+    lines = said.out.splitlines()
+    assert lines[0] == "gfl against SPP HILL, Southwest Power Pool: beta 1.15"
+    assert "  note: constant current in the sag, not constant power [P, P2]" in lines
+    assert "3 pass" in lines
+    assert "evidence: P: primary text read; P2: digest that quotes the primary text" in lines
+    assert lines[-1] == (
+        "Screening only: compare the numbers with the code in force before anyone relies on them."
+    )
+    assert max(map(len, lines)) <= 160
+    assert said.err == ""
+
+
+def test_ride_against_an_envelope_that_is_not_met_is_code_3_and_writes_all_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import csv
+
+    out = tmp_path / "ride"
+    assert run("ride", "gfl", "--against", "nerc-prc-024", "--beta", "1.3", "--out", str(out)) == 3
+    said = capsys.readouterr().out
+    assert "3 pass, 8 FAIL" in said.splitlines()
+    assert "for protection of generators: for comparison, no requirement on loads" in said
+    head, *table = (out / "verdicts.csv").read_text().splitlines()
+    assert head.startswith("# NERC PRC-024; marks of evidence: P = primary text read, ")
+    rows = list(csv.DictReader(table))
+    first = next(row for row in rows if row["segment"] == "0.75-0.9 pu, 3 s")
+    assert (first["verdict"], first["evidence"], first["requirement"]) == ("FAIL", "P", "connected")
+    assert first["what_it_did"].endswith("v_f < V_dip or v_f > V_swell held T_dip")
+    assert len({row["segment"] for row in rows}) == 11
+    signals = sorted(path.name for path in (out / "signals").iterdir())
+    assert (len(signals), signals[2]) == (11, "03-0.75-0.9-pu-3-s.csv")
+    assert (out / "envelope.svg").read_text().startswith("<?xml")
+    assert (out / "envelope.png").stat().st_size > 10_000
+
+
+def test_an_unverified_number_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ride", "gfl", "--against", "semi-f47") == 0
+    said = capsys.readouterr().out
+    assert "status: industry standard [K]" in said
+    assert "K: background knowledge, NOT verified" in said
+    assert len([line for line in said.splitlines() if line.endswith("│ K        │")]) == 4
+
+
+def test_ride_says_what_is_missing_or_too_much(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    way_out = "Way out: --waveform for one course of the voltage, --against for every item of a code.\n"
+    assert run("ride", "gfl") == 2
+    assert capsys.readouterr().err == (
+        f"ride needs either --waveform or --against; neither is there. {way_out}"
+    )
+    assert run("ride", "gfl", "--waveform", "sag-50", "--against", "spp-hill") == 2
+    assert capsys.readouterr().err == f"ride needs either --waveform or --against; both are there. {way_out}"
+    assert run("ride", "gfl", "--against", "spp-hil") == 2
+    assert capsys.readouterr().err.startswith(
+        "there is no envelope 'spp-hil'. Did you mean 'spp-hill'? Known: ercot-nogrr282, caiso-straw-2026, "
+    )
+    assert run("ride", "gfl", "--against", "spp-hill", "--set", "sup.Tdip=1") == 2
+    assert capsys.readouterr().err.startswith(
+        "gfl has no parameter 'sup.Tdip'. Did you mean 'sup.T_dip'? Known: "
+    )
+    out = tmp_path / "file"
+    out.write_text("")
+    assert run("ride", "gfl", "--against", "spp-hill", "--out", str(out)) == 2
+    assert capsys.readouterr().err == (
+        f"{out} is a file, not a folder. Way out: take another folder with --out.\n"
+    )
+
+
+def test_ride_refuses_settings_it_cannot_read_all_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ("sup.T_dip", "sup.T_deep=x", "beta=1.2", "pf=0.9", "pf=0.95")
+    assert run("ride", "gfl", "--waveform", "sag-50", *(a for s in settings for a in ("--set", s))) == 2
+    form = "write NAME=VALUE with a number, for example --set sup.T_dip=2.5."
+    assert capsys.readouterr().err.splitlines() == [
+        "ride: 4 problems",
+        f"  --set sup.T_dip: {form}",
+        f"  --set sup.T_deep=x: {form}",
+        "  --set beta=1.2: beta has a value already. Way out: use --beta.",
+        "  --set pf=0.95: pf has a value already. Way out: give it once.",
+    ]
+
+
+def test_a_rating_without_a_start_is_one_message_and_code_4(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ride", "gfl", "--against", "spp-hill", "--beta", "0.9") == 4
+    said = capsys.readouterr()
+    assert said.err.startswith("gfl: no equilibrium at the first value of the waveform.")
+    assert said.out == ""
+
+
+def test_ride_help_lists_scenarios_and_envelopes_and_loads_nothing_heavy() -> None:
+    from dcvrt import envelopes, scenarios
+
+    heavy = tuple(name for name in HEAVY if name != "pydantic")  # typer reads options with it
+    code = (
+        "import sys; from dcvrt.cli import main\n"
+        "try: main(['ride', '--help'])\n"
+        "except SystemExit as end: assert not end.code\n"
+        f"print('loaded:', [name for name in {heavy!r} if name in sys.modules])"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    assert done.stdout.splitlines()[-1] == "loaded: []"
+    for name in (*scenarios.names(), *envelopes.names()):
+        assert name in done.stdout
+    assert "3 the facility fails an item of the envelope" in done.stdout
 
 
 def test_doctor_names_versions_compiler_and_caches(capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,6 +30,8 @@ OUTPUTS = (
     "p_it",
     "p_cool",
     "mode",
+    "stored",
+    "p_loss",
 )
 SYSTEMS = {name: System(facility.get(name).compile()) for name in VARIANTS}
 
@@ -50,10 +52,12 @@ def outputs(s: System, x: np.ndarray, u: np.ndarray) -> dict[str, float]:
 
 
 def test_names_and_get():
-    assert facility.names() == VARIANTS
+    assert set(VARIANTS) <= set(facility.names())
+    assert facility.get("gfm").name == "gfm"
     with pytest.raises(InputError) as error:
         facility.get("gfl2")
-    assert str(error.value) == "there is no facility variant 'gfl2'. Did you mean 'gfl'? Known: gfl, gfm."
+    known = ", ".join(facility.names())
+    assert str(error.value) == f"there is no facility variant 'gfl2'. Did you mean 'gfl'? Known: {known}."
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -207,11 +211,11 @@ def test_everything_scales_with_the_hosted_capacity(name, h, seed):
     rng = np.random.default_rng(seed)
     x = s.equilibrium(volts(1.0)) + 0.1 * rng.standard_normal(s.dae.x.numel())
     u = volts(rng.uniform(0, 1.1), rng.uniform(-0.5, 0.5))
-    scale = np.array([h if row.unit in ("pu(S)", "pu(I)") else 1.0 for row in s.dae.states])
+    scale = np.array([h if row.unit in ("pu(S)", "pu(I)", "pu(S) s") else 1.0 for row in s.dae.states])
     mode = str(rng.choice(s.automaton.modes))
     small, y_small = s.rate(x, u, mode, 0.1), s.out(x, u, mode, 0.1)
     big = system(name, H=h)
-    scale_y = np.array([h if row.unit in ("pu(S)", "pu(I)") else 1.0 for row in s.dae.outputs])
+    scale_y = np.array([h if row.unit in ("pu(S)", "pu(I)", "pu(S) s") else 1.0 for row in s.dae.outputs])
     np.testing.assert_allclose(
         big.rate(scale * x, u, mode, 0.1), scale * small, rtol=1e-9, atol=1e-9 * max(h, 1)
     )
@@ -377,7 +381,9 @@ def test_unknown_names_in_a_variant():
     f = facility.gfl()
     with pytest.raises(InputError) as error:
         f.set("pll.Kp", 50.0)
-    assert str(error.value) == "pll: there is no parameter 'Kp'. Did you mean 'K_p'? Known: K_p, K_i."
+    assert str(error.value) == (
+        "gfl has no parameter 'pll.Kp'. Did you mean 'pll.K_p'? Known: pll.K_p, pll.K_i."
+    )
     with pytest.raises(InputError, match="Did you mean 'pll'"):
         f.replace("pl", Pll())
     with pytest.raises(InputError, match=r"lim.beta is bound to beta. Set 'beta' instead"):

@@ -14,26 +14,35 @@ PACKAGE = Path(__file__).resolve().parents[1] / "dcvrt"
 # Who may import whom: module or package of dcvrt -> those it may name; the closure of the design's arrows.
 BASE = {"cache", "delimited", "errors"}
 MODELS = BASE | {"dae", "units", "models"}
-INTEGRATORS = BASE | {"dae", "waveform", "trajectory", "integrators"}
-CRITERIA = INTEGRATORS | {"criteria"}
+INTEGRATORS = BASE | {"dae", "linear", "waveform", "trajectory", "integrators"}
+FUNCTIONALS = {"curve", "functionals"}
+CRITERIA = INTEGRATORS | FUNCTIONALS | {"criteria"}
 GRID = BASE | {"units", "waveform", "dae", "grid", "integrators", "trajectory"}
 PLANNING = GRID | CRITERIA | MODELS | {"facility", "planning"}
 ALLOWED = {
     "errors": BASE,
     "cache": BASE,
     "units": BASE,
-    "dae": BASE,
+    "dae": BASE | {"linear"},  # Dae.linearise, and the types of points
+    "linear": BASE | {"dae"},
     "delimited": BASE,
-    "waveform": BASE,
+    "samples": {"errors"},
+    "waveform_tables": {"delimited", "errors", "samples"},
+    "waveform": {"errors", "samples", "waveform_tables"},
+    "scenarios": {"errors", "waveform"},
+    "envelopes": {"errors", "waveform", "trajectory", "criteria", "envelopes"},
     "trajectory": BASE | {"dae", "waveform"},
     "models": MODELS,
     "facility": MODELS | {"facility"},
-    "integrators": INTEGRATORS | {"criteria"},
-    "criteria": BASE | {"trajectory", "dae", "waveform"},
+    "curve": {"errors", "trajectory"},
+    "functionals": {"curve", "errors", "trajectory"},
+    "criteria": BASE | FUNCTIONALS | {"trajectory", "dae", "waveform"},
+    "integrators": CRITERIA,
+    "fmi": {"errors", "units", "dae", "integrators", "fmi"},  # of the integrators the compiler chain only
     "grid": GRID,
     "planning": PLANNING,
-    "studies": PLANNING | {"studies"},
-    "cli": PLANNING | {"studies", "cli"},
+    "studies": PLANNING | {"studies", "scenarios", "envelopes"},
+    "cli": PLANNING | {"fmi", "studies", "cli", "scenarios", "envelopes"},
     "__init__": PLANNING | {"studies", "units"},
 }
 # Heavy packages and the only places that may import them.

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.criteria import Criteria, Margins, margins, only_criteria
+import numpy as np
+from numpy.typing import NDArray
+
+from dcvrt.criteria import Criteria, Margins
 from dcvrt.errors import InputError, SimulationError, raise_all
+from dcvrt.functionals import Functional, Outcome, evaluate
+from dcvrt.integrators.asked import Asked
 from dcvrt.trajectory import COMPLETED, Trajectory
 from dcvrt.waveform import Waveform
 
@@ -15,6 +20,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from dcvrt.integrators.simulator import Simulator
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +34,7 @@ class BatchResult:
     status : ``"completed"`` or the sentence that says why not.
     margins : margins of each case, None where the run failed or no criteria were given.
     runs : trajectories when `keep` was asked for, else None.
+    functionals : those asked for, by name; none where the run failed.
     """
 
     waveforms: tuple[str, ...]
@@ -34,6 +42,7 @@ class BatchResult:
     status: tuple[str, ...]
     margins: tuple[Margins | None, ...]
     runs: tuple[Trajectory | None, ...]
+    functionals: tuple[Mapping[str, Outcome], ...]
 
     def __len__(self) -> int:
         return len(self.status)
@@ -44,12 +53,14 @@ class BatchResult:
         return tuple(k for k, s in enumerate(self.status) if s != COMPLETED)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat mapping per case: parameters, margins with gradients, diagnostics, sequence, status."""
+        """One flat mapping per case: parameters, functionals, margins, diagnostics, sequence, status."""
         result = []
-        for name, values, status, m in zip(
-            self.waveforms, self.parameters, self.status, self.margins, strict=True
+        for name, values, status, m, found in zip(
+            self.waveforms, self.parameters, self.status, self.margins, self.functionals, strict=True
         ):
             row: dict[str, Any] = {"waveform": name, **values}
+            for column, outcome in found.items():
+                row |= outcome.flat(column)
             if m is not None:
                 row |= m.flat()
             row["status"] = status
@@ -69,28 +80,94 @@ def run_batch(
     table: Mapping[str, float | Sequence[float]],
     criteria: Criteria | None,
     keep: bool,
+    functionals: Mapping[str, Functional] | None = None,
 ) -> BatchResult:
     """Run every case of the table."""
-    if criteria is not None:
-        only_criteria(criteria)
-    cases = _cases(simulator, waveforms, table)
-    status: list[str] = []
-    found: list[Margins | None] = []
-    runs: list[Trajectory | None] = []
-    for waveform, values in cases:
-        run: Trajectory | None = None
-        try:
-            run = simulator.attempt(waveform, None, **values)
-            outcome = run.status
-        except SimulationError as error:
-            outcome = str(error)
-        status.append(outcome)
-        done = run is not None and run.completed
-        found.append(margins(run, criteria) if run is not None and done and criteria is not None else None)
-        runs.append(run if keep else None)
+    cases, P = _cases(simulator, waveforms, table)
+    span = min(w.until - w.start for w, _ in cases)
+    asked = Asked.of(criteria, functionals, simulator.dae.y_names, simulator.dae.p_names, span)
+    if simulator._on_kernel():
+        answers = _on_kernel(simulator, [w for w, _ in cases], P, asked)
+    else:
+        answers = [_one_run(simulator, w, values, asked, keep) for w, values in cases]
+    runs = [answer.run for answer in answers]
+    if keep and simulator._on_kernel():
+        runs = [_kept(simulator, w, values) for w, values in cases]
     return BatchResult(
-        tuple(w.name for w, _ in cases), tuple(v for _, v in cases), tuple(status), tuple(found), tuple(runs)
+        tuple(w.name for w, _ in cases),
+        tuple(v for _, v in cases),
+        tuple(answer.status for answer in answers),
+        tuple(answer.margins for answer in answers),
+        tuple(runs),
+        tuple(answer.functionals for answer in answers),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """Outcome of one case."""
+
+    status: str
+    margins: Margins | None = None
+    functionals: Mapping[str, Outcome] = field(default_factory=dict)
+    run: Trajectory | None = None
+
+    @classmethod
+    def of(
+        cls, asked: Asked, found: Mapping[str, Outcome], sequence: tuple[str, ...], run: Trajectory | None
+    ) -> _Answer:
+        """Answer of a completed run; a run that cannot be judged is a failed one."""
+        try:
+            return cls(COMPLETED, *asked.answers(found, sequence), run)
+        except SimulationError as error:
+            return cls(str(error), run=run)
+
+
+def _one_run(
+    simulator: Simulator, waveform: Waveform, values: Mapping[str, float], asked: Asked, keep: bool
+) -> _Answer:
+    """A case by a run of its own."""
+    try:
+        run = simulator.attempt(waveform, None, **values)
+    except SimulationError as error:
+        return _Answer(str(error))
+    kept = run if keep else None
+    if not run.completed:
+        return _Answer(run.status, run=kept)
+    return _Answer.of(asked, evaluate(asked.everything, run), run.sequence, kept)
+
+
+def _on_kernel(simulator: Simulator, waveforms: Sequence[Waveform], P: Array, asked: Asked) -> list[_Answer]:
+    """All cases in the lanes of the kernel."""
+    from dcvrt.integrators.kernel.ensemble import Ensemble
+    from dcvrt.integrators.kernel.functionals import Table, watched
+
+    tangents = any(name in w.tangents for w in waveforms for name in simulator.wrt)
+    kernel = simulator._kernel(tangents, watched(asked.everything))
+    tables = [simulator._table(kernel, w) for w in waveforms]
+    X, Z, unstarted = simulator._begin_all(kernel, [channels for channels, _ in tables], P)
+    answers = {k: _Answer(message) for k, message in unstarted.items()}
+    started = [k for k in range(len(P)) if k not in unstarted]
+    if started:
+        wanted = Table.of(asked.everything, values_only=asked.values_only) if asked.everything else None
+        inputs = [tables[k][1] for k in started]
+        ensemble = Ensemble(kernel, inputs, P[started], X[started], Z[started], wanted)
+        for number, k in enumerate(started):
+            status = ensemble.status(number)
+            answers[k] = (
+                _Answer.of(asked, ensemble.outcomes(number), ensemble.sequence(number), None)
+                if status == COMPLETED
+                else _Answer(status)
+            )
+    return [answers[k] for k in range(len(P))]
+
+
+def _kept(simulator: Simulator, waveform: Waveform, values: Mapping[str, float]) -> Trajectory | None:
+    """The trajectory of a case, by a run of its own; none without an equilibrium."""
+    try:
+        return simulator.attempt(waveform, None, **values)
+    except SimulationError:
+        return None
 
 
 def only_waveform(waveform: object) -> None:
@@ -110,7 +187,8 @@ def only_waveform(waveform: object) -> None:
 
 def _cases(
     simulator: Simulator, waveforms: Sequence[Waveform], table: Mapping[str, float | Sequence[float]]
-) -> list[tuple[Waveform, dict[str, float]]]:
+) -> tuple[list[tuple[Waveform, dict[str, float]]], Array]:
+    """Waveform and values of every case, and all parameters as rows."""
     if isinstance(waveforms, Waveform):
         waveforms = [waveforms]
     for waveform in waveforms if not isinstance(waveforms, str) else [waveforms]:
@@ -137,10 +215,11 @@ def _cases(
         for k in range(n)
     ]
     problems: dict[str, None] = {}
+    rows = []
     for _, values in cases:
         try:
-            simulator.dae.parameter_values(**values)
+            rows.append(simulator.dae.parameter_values(**values))
         except InputError as error:
             problems |= dict.fromkeys(str(error).splitlines())
     raise_all(list(problems), "batch")
-    return cases
+    return cases, np.array(rows)

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -98,7 +98,7 @@ def compiled(
     """
     compiler = find_compiler()
     if compiler is None:
-        _say_interpreted()
+        say_interpreted()
         return {f.name(): f for f in functions}, "CasADi interpreter (no C compiler found)"
     names = [f.name() for f in functions]
     generator = ca.CodeGenerator("model.c", {"with_header": False, "casadi_int": "long long int"})
@@ -112,12 +112,46 @@ def compiled(
     return loaded, f"compiled by {compiler}"
 
 
-def build(text: str, compiler: Compiler) -> Path:
-    """Object of this C text, from the cache or compiled now."""
-    flags = FLAGS if len(text) < LONG_TEXT else LONG_FLAGS
-    key = "\n".join(
-        (text, *compiler.command, compiler.version, *flags, platform.machine(), platform.processor())
-    )
+@lru_cache(maxsize=8)
+def native_flags(compiler: Compiler) -> tuple[str, ...]:
+    """Flags that let the compiler use all instructions of this processor, if it knows how."""
+    for flag in ("-march=native", "-mcpu=native"):
+        command = [*compiler.command, flag, "-E", "-x", "c", os.devnull]
+        if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+            return (flag,)
+    return ()
+
+
+@lru_cache(maxsize=1)
+def processor() -> str:
+    """What identifies the processor: an object made for one may use instructions that another lacks."""
+    told = [platform.machine(), platform.processor()]
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
+        told += [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
+    except OSError:  # not Linux
+        pass
+    return "\n".join(told)
+
+
+def build(
+    text: str | Mapping[str, str],
+    compiler: Compiler,
+    flags: Sequence[str] | None = None,
+    units: Sequence[str] = ("model.c",),
+) -> Path:
+    """Object of this C text, from the cache or compiled now.
+
+    Parameters
+    ----------
+    text : the C text, or several files by name, of which `units` are compiled and the others included.
+    flags : for the compiler; by the length of the text unless given.
+    """
+    files = {"model.c": text} if isinstance(text, str) else dict(text)
+    if flags is None:
+        flags = FLAGS if sum(map(len, files.values())) < LONG_TEXT else LONG_FLAGS
+    named = [f"{name}\n{files[name]}" for name in sorted(files)]
+    key = "\n".join((*named, *compiler.command, compiler.version, *flags, *units, processor()))
     folder = cache_folder()
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.so"
     if path.is_file():
@@ -131,10 +165,11 @@ def build(text: str, compiler: Compiler) -> Path:
             "Set DCVRT_CACHE_DIR to one that can."
         ) from None
     with place as scratch:
-        source, made = Path(scratch) / "model.c", Path(scratch) / "model.so"
-        source.write_text(text, encoding="utf-8")
+        made = Path(scratch) / "model.so"
+        for name, content in files.items():
+            (Path(scratch) / name).write_text(content, encoding="utf-8")
         done = subprocess.run(
-            [*compiler.command, *flags, str(source), "-o", str(made), "-lm"],
+            [*compiler.command, *flags, *(str(Path(scratch) / u) for u in units), "-o", str(made), "-lm"],
             capture_output=True,
             text=True,
             check=False,
@@ -149,7 +184,8 @@ def build(text: str, compiler: Compiler) -> Path:
 
 
 @lru_cache(maxsize=1)
-def _say_interpreted() -> None:
+def say_interpreted() -> None:
+    """Warn, once, that there is no compiler."""
     warnings.warn(
         "No C compiler was found: CasADi interprets the model, several times slower with the same numbers. "
         "Install gcc or clang, or pip install 'dcvrt[compiler]'.",

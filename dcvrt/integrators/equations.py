@@ -76,6 +76,10 @@ class Equations:
     """
 
     def __init__(self, dae: Dae, wrt: tuple[str, ...], tangents: bool) -> None:
+        if not dae.states:
+            raise ModelError(
+                f"{dae.name} has no states: there is nothing to integrate. Way out: add a block with a state."
+            )
         self.dae = dae
         self.columns = directions(dae, wrt)
         self.tangents = tangents and bool(wrt)

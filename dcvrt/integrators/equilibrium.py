@@ -10,11 +10,15 @@ keep their start values. With J = d(f, g)/d(x, z) and its pseudo-inverse J^+,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.errors import SimulationError
+from dcvrt.dae import Dae
+from dcvrt.errors import InputError, SimulationError, did_you_mean
 from dcvrt.integrators.equations import Equations
+from dcvrt.linear import OperatingPoint, chosen_modes
 
 Array = NDArray[np.float64]
 RANK_TOLERANCE = 1e-10
@@ -24,13 +28,21 @@ ROUGH, POLISH = 1e-3, 2
 MAX_ITERATIONS = 60
 
 
-def equilibrium(equations: Equations, u: Array, p: Array, q: Array, u_theta: Array) -> tuple[Array, Array]:
+def equilibrium(
+    equations: Equations,
+    u: Array,
+    p: Array,
+    q: Array,
+    u_theta: Array,
+    where: str = "at the first value of the waveform",
+) -> tuple[Array, Array]:
     """Find (x, z) at rest and its derivative by every theta.
 
     Parameters
     ----------
     u, p, q : inputs, parameters and flags of the start modes.
     u_theta : derivative of the inputs by every theta, (inputs, thetas).
+    where : which inputs these are, for the error.
 
     Returns
     -------
@@ -40,7 +52,7 @@ def equilibrium(equations: Equations, u: Array, p: Array, q: Array, u_theta: Arr
     Raises
     ------
     SimulationError
-        no equilibrium was found; the five largest residuals are named.
+        no equilibrium was found; the modes and the five largest residuals are named.
     """
     start, start_pu = (np.array(m) for m in equations.start(u, p))
     w = start[:, 0]
@@ -58,19 +70,52 @@ def equilibrium(equations: Equations, u: Array, p: Array, q: Array, u_theta: Arr
                 break
             cut /= 2
             if cut < 1e-6:
-                _fail(equations, residual[:, 0])
+                _fail(equations, residual[:, 0], q, where)
         w = w + cut * step
         undamped += cut == 1.0 and size < ROUGH
         residual, jacobian, by_pu = (np.array(m) for m in trial)
         size = np.abs(residual).max(initial=0.0)
     if not size < RESIDUAL_TOLERANCE:
-        _fail(equations, residual[:, 0])
+        _fail(equations, residual[:, 0], q, where)
     inverse = _pseudo_inverse(jacobian)
     open_directions = np.eye(len(w)) - inverse @ jacobian
     w_theta = -inverse @ _by_theta(equations, by_pu, u_theta) + open_directions @ _by_theta(
         equations, start_pu, u_theta
     )
     return w, w_theta
+
+
+def rest_point(
+    equations: Equations,
+    v: complex | None,
+    inputs: Mapping[str, float] | None,
+    modes: Mapping[str, str] | None,
+    parameters: Mapping[str, float],
+) -> OperatingPoint:
+    """The point at rest: see :meth:`Simulator.equilibrium`."""
+    dae = equations.dae
+    u = np.array([row.value for row in dae.inputs], dtype=float)
+    named = []
+    if v is not None:
+        if equations.voltage is None:
+            raise InputError(
+                f"{dae.name} has no phasor input for v = {v:g}. Way out: inputs={{name: value}}."
+            )
+        re, im = equations.voltage
+        u[re], u[im] = complex(v).real, complex(v).imag
+        named.append(f"{dae.u_names[re].removesuffix('.re')} = {v:g}")
+    for name, value in (inputs or {}).items():
+        if name not in dae.u_names:
+            raise InputError(f"{dae.name} has no input {name!r}.{did_you_mean(name, dae.u_names)}")
+        u[dae.u_names.index(name)] = value
+        named.append(f"{name} = {value:g}")
+    p = dae.parameter_values(**parameters)
+    chosen = chosen_modes(dae, modes)
+    x, z = np.zeros(equations.nx), np.zeros(equations.nz)
+    flags = OperatingPoint(dae, x, z, u, p, chosen).flags
+    where = f"at {', '.join(named)}" if named else "at the rest values of the inputs"
+    w, _ = equilibrium(equations, u, p, flags, np.zeros((equations.nu, equations.nw)), where)
+    return OperatingPoint(dae, w[: equations.nx], w[equations.nx :], u, p, chosen)
 
 
 def given_start(equations: Equations, u: Array, p: Array, u_theta: Array) -> tuple[Array, Array]:
@@ -97,15 +142,29 @@ def _pseudo_inverse(jacobian: Array) -> Array:
     return np.linalg.pinv(jacobian / scale[:, None], rcond=RANK_TOLERANCE) / scale
 
 
-def _fail(equations: Equations, residual: Array) -> None:
+def _fail(equations: Equations, residual: Array, q: Array, where: str) -> None:
     dae = equations.dae
-    names = [*(f"d({n})/dt" for n in dae.x_names), *(f"residual of {r.path}" for r in dae.algebraics)]
-    order = sorted(
-        range(len(names)), key=lambda k: -abs(residual[k]) if np.isfinite(residual[k]) else -np.inf
-    )
-    worst = "\n".join(f"  {names[k]} = {residual[k]:.3g}" for k in order[:5])
+    names = [*(f"d({r.path})/dt" for r in dae.states), *(f"residual of {r.path}" for r in dae.algebraics)]
+    units = [*(f"{r.unit}/s" for r in dae.states), *("" if r.unit == "1" else r.unit for r in dae.algebraics)]
+    size = np.where(np.isfinite(residual), np.abs(residual), np.inf)
+    order = sorted(range(len(names)), key=lambda k: -size[k])
+    worst = "\n".join(f"  {names[k]} = {residual[k]:.3g} {units[k]}".rstrip() for k in order[:5])
+    modes = _modes_of(dae, q)
+    mode = f" in mode {modes}" if modes else ""
     raise SimulationError(
-        f"{dae.name}: no equilibrium at the first value of the waveform. Largest residuals:\n{worst}\n"
-        "Check that the facility can import its load before the disturbance (beta V must exceed the load "
-        "factor d), and the start values."
+        f"{dae.name}: no equilibrium {where}. Largest residuals{mode}:\n{worst}\n"
+        "Ways out: parameters or an input at which these equations can all be zero (a facility must be able "
+        "to import its load before the disturbance: beta |V| above the load factor d); better start values "
+        "(State(start), rest()); start='given' for a system that never rests."
     )
+
+
+def _modes_of(dae: Dae, q: Array) -> str:
+    """Modes that the flags belong to: ``sup NORMAL, cooling RUNNING``."""
+    names, at = [], 0
+    for a in dae.automata:
+        own = q[at : at + a.flags.shape[1]]
+        at += a.flags.shape[1]
+        fitting = [mode for k, mode in enumerate(a.modes) if (a.flags[k] == own).all()]
+        names.append(f"{a.path} {a.start if a.start in fitting else '/'.join(fitting)}")
+    return ", ".join(names)

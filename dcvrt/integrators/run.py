@@ -21,17 +21,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dcvrt.integrators import sentences
 from dcvrt.integrators.channels import Channels
 from dcvrt.integrators.crossing import first_crossing
 from dcvrt.integrators.model import Model
+from dcvrt.integrators.sentences import MAX_EVENTS, MAX_JUMPS_AT_ONCE
 from dcvrt.trajectory import COMPLETED, Event
 
 Array = NDArray[np.float64]
 
 SAME_INSTANT = 1e-9
 """Jumps closer than this, s, are at one instant; a guard is judged by its sign this long after it."""
-MAX_JUMPS_AT_ONCE = 50
-MAX_EVENTS = 10_000
 LOCATED = 1e-12
 FIRST_LOOK, LONGEST_LOOK = 0.02, 0.5
 """A stretch after a restart is short, since the next event is often near; then stretches double, s."""
@@ -200,15 +200,8 @@ class Run:
     def _failure(self, why: str, begin: float, end: float) -> str:
         eq = self.equations
         rates = self.model.at("flow", self.t, self.X, self.Z, self.P, self.inputs.C[self.k])[0][:, 0]
-        worst = int(np.argmax(np.where(np.isfinite(rates), np.abs(rates), np.inf)))
-        modes = (
-            ", ".join(a.modes[m] for a, m in zip(eq.dae.automata, self.modes, strict=True)) or "no automaton"
-        )
-        last = str(self.events[-1]) if self.events else "none"
-        return (
-            f"integration failed between {begin:.6g} and {end:.6g} s in mode {modes}: {why}; fastest state "
-            f"{eq.dae.x_names[worst]} = {self.X[worst]:.4g}, rate {rates[worst]:.4g} 1/s; last event: {last}"
-        )
+        last = self.events[-1] if self.events else None
+        return sentences.failed(eq.dae, why, begin, end, self.modes, self.X, rates, last)
 
     # -- what happens on a stretch ------------------------------------------------------------------------
 
@@ -419,17 +412,13 @@ class Run:
             Event(self.t, automaton.path, transition.source, transition.target, transition.text, tie, grad)
         )
         if len(self.events) > MAX_EVENTS:
-            raise Ended(f"more than {MAX_EVENTS} events up to {self.t:.6g} s: the automaton chatters")
+            raise Ended(sentences.too_many_events(self.t))
 
     def _count_jump(self, path: str, source: str, target: str) -> None:
         self.jumps_at_instant += 1
         self.visited.append(f"{path}: {source} -> {target}")
         if self.jumps_at_instant > MAX_JUMPS_AT_ONCE:
-            circle = sorted(set(self.visited))
-            raise Ended(
-                f"more than {MAX_JUMPS_AT_ONCE} jumps at {self.t:.6g} s between {', '.join(circle)}: "
-                "the guards of these modes are true together; give them hysteresis or a dwell time (held)"
-            )
+            raise Ended(sentences.chatter(self.t, self.visited))
 
     def _set_timers(self, positive: NDArray[np.bool_], dte: Array) -> None:
         active = self.source == np.array(self.modes)[self.automaton]
@@ -476,8 +465,7 @@ class Run:
             if np.abs(step).max() < 1e-12 * (1 + np.abs(self.Z[: eq.nz]).max()):
                 break
         else:
-            names = ", ".join(r.path for r in eq.dae.algebraics)
-            raise Ended(f"no consistent value of {names} at {self.t:.6g} s")
+            raise Ended(sentences.not_consistent(eq.dae, self.t))
         if eq.nw:
             self.Z[eq.nz :] = -np.linalg.solve(jacobian, slope).T.ravel()
 
@@ -487,8 +475,4 @@ class Run:
                 self._leave_bounds(number)
 
     def _leave_bounds(self, number: int) -> None:
-        k, sign, bound = self.equations.bounds[number]
-        row = self.equations.dae.states[k]
-        side = "above" if sign > 0 else "below"
-        what = row.crossing or f"{row.path} left its range"
-        raise Ended(f"{what} at {self.t:.3f} s ({row.path} {side} {bound:g} {row.unit})")
+        raise Ended(sentences.left_bounds(self.equations.dae, *self.equations.bounds[number], self.t))

@@ -10,11 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf
 
 import casadi as ca
 
+from dcvrt.dae import Gap
 from dcvrt.errors import did_you_mean
+from dcvrt.models.expressions import text_of
 from dcvrt.models.phasor import Scalar
 
 
@@ -31,7 +32,7 @@ class Comparison:
         return self.side * (self.signal - self.limit)
 
     def __str__(self) -> str:
-        return f"{self.signal} {'>' if self.side > 0 else '<'} {self.limit}"
+        return f"{text_of(self.signal)} {'>' if self.side > 0 else '<'} {text_of(self.limit)}"
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Go:
     reset: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        timed = "" if str(self.held) == "0" else f" held {self.held}"
+        timed = "" if text_of(self.held) == "0" else f" held {text_of(self.held)}"
         return f"{self.source} -> {self.target}: {self.when}{timed}"
 
 
@@ -140,47 +141,33 @@ def check_table(modes: Sequence[str], start: str, rows: Sequence[Go]) -> list[st
     return problems
 
 
-Box = dict[str, tuple[float, float]]
+def gaps(rows: Sequence[Go], settle: Callable[[Scalar], ca.SX | None]) -> list[Gap]:
+    """Pairs of rows A -> B and B -> A, with the distance that their limits must keep for them not to chatter.
 
-
-def check_hysteresis(rows: Sequence[Go], value: Callable[[Scalar], float]) -> list[str]:
-    """Problems of pairs of rows A -> B and B -> A whose guards can be true, or touch, at the same values.
-
-    Such a pair chatters. `value` gives the number of a limit at the parameters' present values. Timers
-    (a guard that is always true) are left out: their dwell time separates the jumps.
+    In every combination of their cases some signal must not be able to satisfy both. Timers (a guard that is
+    always true) are left out: their dwell time separates the jumps. `settle` puts an expression in terms of
+    the parameters, or gives None where it varies in time: such a distance cannot be told before a run, and is
+    left to the guard against chatter in the run.
     """
-
-    def boxes(guard: Guard) -> list[Box]:
-        found = []
-        for case in guard.cases:
-            box: Box = {}
-            for c in case:
-                low, high = box.get(str(c.signal), (-inf, inf))
-                limit = value(c.limit)
-                box[str(c.signal)] = (max(low, limit), high) if c.side > 0 else (low, min(high, limit))
-            found.append(box)
-        return found
-
-    def apart(one: Box, other: Box) -> bool:
-        return any(
-            one[signal][0] > other[signal][1] or other[signal][0] > one[signal][1]
-            for signal in one.keys() & other.keys()
-        )
-
-    problems = []
+    found = []
     for there, back in itertools.combinations(rows, 2):
-        if (there.source, there.target) != (
-            back.target,
-            back.source,
-        ) or () in there.when.cases + back.when.cases:
+        opposite = (there.source, there.target) == (back.target, back.source)
+        if not opposite or () in there.when.cases + back.when.cases:
             continue
-        if not all(apart(a, b) for a in boxes(there.when) for b in boxes(back.when)):
-            limits = {
-                str(c.limit): value(c.limit) for row in (there, back) for case in row.when.cases for c in case
-            }
-            values = ", ".join(f"{name} = {number:g}" for name, number in limits.items())
-            problems.append(
-                f"'{there}' and '{back}' leave no gap between them ({values}): the modes would chatter. "
-                "Set the limit of the way back beyond that of the way out."
-            )
-    return problems
+        for one, other in itertools.product(there.when.cases, back.when.cases):
+            against = [
+                (a, b)
+                for a, b in itertools.product(one, other)
+                if str(a.signal) == str(b.signal) and a.side != b.side
+            ]
+            distances = [settle(a.side * (a.limit - b.limit)) for a, b in against]
+            known = [distance for distance in distances if distance is not None]
+            if len(known) < len(distances):
+                continue
+            width = ca.SX(-1)  # for guards on different signals, which can be true together
+            for k, distance in enumerate(known):
+                width = ca.fmax(width, distance) if k else distance
+            involved = [c for pair in against for c in pair] or [*one, *other]
+            limits = {text_of(c.limit): settled for c in involved if (settled := settle(c.limit)) is not None}
+            found.append(Gap((str(there), str(back)), width, tuple(limits.items())))
+    return found

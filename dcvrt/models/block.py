@@ -5,121 +5,46 @@ The same `equations` run on numbers (in tests, by hand) and on CasADi symbols (w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from math import inf
 from types import SimpleNamespace
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
 from dcvrt.errors import InputError, ModelError, did_you_mean, outside, raise_all
 from dcvrt.models.automaton import Go
+from dcvrt.models.declared import (
+    Algebraic,
+    D,
+    Declared,
+    Input,
+    Output,
+    Parameter,
+    Part,
+    Port,
+    State,
+    UnknownNameError,
+)
 from dcvrt.models.phasor import Phasor, Scalar
 from dcvrt.units import dimension
 
+__all__ = [
+    "Algebraic",
+    "Block",
+    "Declared",
+    "Equations",
+    "Input",
+    "Output",
+    "Parameter",
+    "Port",
+    "State",
+    "UnknownNameError",
+    "check_equations",
+]
+
 RESERVED = {"values", "sources", "clock", "mode"}
 """Names that mean something to every block, beside those of the class."""
-
-
-class UnknownNameError(ModelError, AttributeError):
-    """A symbol or port that the block does not declare."""
-
-
-@dataclass(eq=False)
-class Declared:
-    """Something that a block declares by name."""
-
-    name: str = field(default="", init=False)
-    unit: str = ""
-    doc: str = ""
-    kind: type = field(default=float, kw_only=True)
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, block: Block | None, owner: type | None = None) -> Any:
-        return self if block is None else Port(block, self)
-
-
-@dataclass(eq=False)
-class Parameter(Declared):
-    """A constant of the block: value, unit, range it may be set in, meaning, source of the value."""
-
-    value: float = 0.0
-    bounds: tuple[float, float] = (-inf, inf)
-    source: str = "not stated"
-
-    def __init__(
-        self,
-        value: float,
-        unit: str,
-        bounds: tuple[float, float] = (-inf, inf),
-        doc: str = "",
-        source: str = "not stated",
-    ) -> None:
-        self.name, self.unit, self.doc, self.kind = "", unit, doc, float
-        self.value, self.bounds, self.source = float(value), bounds, source
-
-    def __get__(self, block: Block | None, owner: type | None = None) -> Any:
-        return self if block is None else block.values[self.name]
-
-
-@dataclass(eq=False)
-class Input(Declared):
-    """A signal that another block, or the diagram, must feed."""
-
-
-@dataclass(eq=False)
-class Output(Declared):
-    """A signal that the block computes."""
-
-
-@dataclass(eq=False)
-class State(Declared):
-    """A variable with a derivative.
-
-    `start` is the value that the search of the equilibrium begins with, unless the block's `rest` gives a
-    better one. `bounds` is the range in which the equations are valid, `crossing` what it means to leave it.
-    """
-
-    start: float = 0.0
-    bounds: tuple[float, float] = (-inf, inf)
-    crossing: str = ""
-
-    def __init__(
-        self,
-        start: float,
-        unit: str,
-        doc: str = "",
-        bounds: tuple[float, float] = (-inf, inf),
-        crossing: str = "",
-    ) -> None:
-        self.name, self.unit, self.doc, self.kind = "", unit, doc, float
-        self.start, self.bounds, self.crossing = float(start), bounds, crossing
-
-
-@dataclass(eq=False)
-class Algebraic(Declared):
-    """A variable defined by an equation 0 = residual."""
-
-    start: float = 0.0
-
-    def __init__(self, start: float, unit: str, doc: str = "") -> None:
-        self.name, self.unit, self.doc, self.kind, self.start = "", unit, doc, float, float(start)
-
-
-@dataclass(frozen=True)
-class Port:
-    """One named signal of one block, or of the diagram itself (`block` is None), as `connect` takes it."""
-
-    block: Block | None
-    declared: Declared
-
-    def __str__(self) -> str:
-        if self.block is None:
-            return self.declared.name
-        return f"{self.block.name or type(self.block).__name__}.{self.declared.name}"
 
 
 @dataclass(frozen=True)
@@ -139,10 +64,7 @@ class Namespace(SimpleNamespace):
         raise UnknownNameError(f"{self._owner} has no symbol or value {name!r}.{did_you_mean(name, known)}")
 
 
-D = TypeVar("D", bound=Declared)
-
-
-class Block:
+class Block(Part):
     """Base of every block.
 
     A subclass declares :class:`Parameter`, :class:`Input`, :class:`Output`, :class:`State` and
@@ -156,7 +78,6 @@ class Block:
     Lines of the docstring that start with ``Differs:`` say where the block departs from the paper.
     """
 
-    name: str = ""
     values: dict[str, float]
     sources: dict[str, str]
     modes: ClassVar[tuple[str, ...]] = ()
@@ -213,8 +134,7 @@ class Block:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        who = f"{self.name} ({type(self).__name__})" if self.name else type(self).__name__
-        raise UnknownNameError(f"{who} has no {name!r}.{did_you_mean(name, self._declared)}")
+        raise self.unknown(name)
 
     # ---- what a subclass gives -------------------------------------------------------------------------
 
@@ -244,10 +164,12 @@ class Block:
         10.0
         """
         mode = values.pop("mode", self.start)
-        known = {*self._declared, *self.flags, "clock"}
+        known = [*self._declared, *self.flags, *(["clock", "mode"] if self.modes else [])]
         problems = [
             f"there is no {name!r}.{did_you_mean(name, known)}" for name in values if name not in known
         ]
+        if mode and mode not in self.modes:
+            problems.append(f"there is no mode {mode!r}.{did_you_mean(mode, self.modes)}")
         raise_all(problems, type(self).__name__, InputError)
         given = dict(self.values)
         if self.modes:
@@ -271,6 +193,21 @@ class Block:
             table |= {name: symbol(name, float) for name in (*self.flags, "clock")}
         return Namespace(_owner=f"{path} ({type(self).__name__})", **table)
 
+    def feedthrough(self) -> dict[str, tuple[str, ...]]:
+        """Inputs that each output depends on at once, without a state between: read from the equations.
+
+        >>> from dcvrt.models import CurrentReference
+        >>> CurrentReference().feedthrough()
+        {'i': ('v', 'delta', 'p_c', 'q_c'), 'v_dq': ('v', 'delta')}
+        """
+        s = self.symbols(self.name or type(self).__name__)
+        out = self.equations(s).out
+        inputs = self.declared(Input)
+        return {
+            name: tuple(k for k in inputs if ca.depends_on(stack([out[name]]), stack([getattr(s, k)])))
+            for name in self.declared(Output)
+        }
+
     def notes(self) -> list[str]:
         """The deviations from the paper: the ``Differs:`` lines of the docstring, each joined to one line."""
         notes: list[str] = []
@@ -285,6 +222,15 @@ class Block:
             else:
                 inside = False
         return notes
+
+
+def stack(columns: Iterable[Any]) -> ca.SX:
+    """Numbers, symbols, columns and phasors in one column of SX."""
+    flat: list[Any] = []
+    for value in columns:
+        flat += [value.re, value.im] if isinstance(value, Phasor) else [value]
+    joined: Any = ca.vertcat(*flat) if flat else ca.SX(0, 1)
+    return ca.SX(joined)
 
 
 def check_equations(path: str, block: Block, eq: Any) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,25 +11,29 @@ import numpy as np
 
 from dcvrt.dae import Automaton, Dae, Row
 from dcvrt.errors import ModelError, did_you_mean, raise_all
-from dcvrt.models.block import Algebraic, Equations, Input, Output, Parameter, State, check_equations
-from dcvrt.models.diagram import Diagram, End, path_of
+from dcvrt.models.algebraic import check_regular
+from dcvrt.models.block import (
+    Algebraic,
+    Equations,
+    Input,
+    Output,
+    Parameter,
+    State,
+    check_equations,
+    stack,
+)
+from dcvrt.models.declared import Declared
+from dcvrt.models.diagram import Diagram
+from dcvrt.models.netlist import Netlist, netlist
 from dcvrt.models.phasor import Phasor
-from dcvrt.models.structure import find, structure_problems
+from dcvrt.models.structure import structure_problems
 from dcvrt.models.table import build_automaton
+from dcvrt.models.wiring import End, path_of
 
 WAYS_OUT = (
     "Ways out: put a lag in the path, or mark one wire connect(..., implicit=True) "
     "to solve it as an algebraic variable."
 )
-
-
-def stack(columns: Iterable[Any]) -> ca.SX:
-    """Numbers, symbols, columns and phasors in one column of SX."""
-    flat: list[Any] = []
-    for value in columns:
-        flat += [value.re, value.im] if isinstance(value, Phasor) else [value]
-    joined: Any = ca.vertcat(*flat) if flat else ca.SX(0, 1)
-    return ca.SX(joined)
 
 
 def parts(name: str, kind: type) -> list[str]:
@@ -58,30 +62,36 @@ class Flattener:
     Feedthrough is exact: an output needs an input if and only if its expression depends on it.
     """
 
-    def __init__(self, diagram: Diagram) -> None:
-        self.diagram = diagram
-        self.s = {name: block.symbols(name) for name, block in diagram.blocks.items()}
+    def __init__(self, net: Netlist) -> None:
+        self.net = net
+        self.s = {path: block.symbols(path) for path, block in net.blocks.items()}
         self.eq: dict[str, Equations] = {}
         problems = []
-        for name, block in diagram.blocks.items():
-            self.eq[name] = block.equations(self.s[name])
-            problems += check_equations(name, block, self.eq[name])
-        raise_all(problems, diagram.name, ModelError)
-        self.u = {name: signal(name, declared.kind) for name, (declared, _) in diagram.inputs.items()}
+        for path, block in net.blocks.items():
+            self.eq[path] = block.equations(self.s[path])
+            problems += check_equations(path, block, self.eq[path])
+        raise_all(problems, net.name, ModelError)
+        self.u = {name: signal(name, declared.kind) for name, (declared, _) in net.inputs.items()}
         self.implicit = {
-            target: signal(path_of(target), diagram.blocks[target[0]].declared(Input)[target[1]].kind)
-            for target, wire in diagram.wires.items()
+            target: signal(path_of(target), self.declared(target).kind)
+            for target, wire in net.wires.items()
             if wire.implicit
         }
         self._values: dict[End, Any] = {}
         self._open: list[End] = []
+
+    def declared(self, end: End) -> Declared:
+        """What stands at the end of a wire; structure_problems has seen that something does."""
+        found = self.net.find(end)
+        assert found is not None
+        return found
 
     # ---- values ---------------------------------------------------------------------------------------
 
     def needs(self, block: str, value: Any) -> list[str]:
         """Inputs of the block that an expression of its symbols depends on."""
         own = self.s[block]
-        inputs = self.diagram.blocks[block].declared(Input)
+        inputs = self.net.blocks[block].declared(Input)
         return [name for name in inputs if ca.depends_on(stack([value]), stack([getattr(own, name)]))]
 
     def at_end(self, end: End) -> Any:
@@ -89,7 +99,9 @@ class Flattener:
         block, name = end
         if not block:
             return self.u[name]
-        if name not in self.diagram.blocks[block].declared(Output):
+        if end in self.net.junctions:
+            return self.at_input(end)
+        if name not in self.net.blocks[block].declared(Output):
             return getattr(self.s[block], name)
         if end not in self._values:
             if end in self._open:
@@ -101,11 +113,9 @@ class Flattener:
 
     def at_input(self, target: End) -> Any:
         """Value that arrives at an input."""
-        return (
-            self.implicit[target]
-            if target in self.implicit
-            else self.at_end(self.diagram.wires[target].source)
-        )
+        if target in self.implicit:
+            return self.implicit[target]
+        return self.at_end(self.net.wires[target].source)
 
     def resolve(self, block: str, value: Any) -> Any:
         """An expression of a block's own symbols with its inputs replaced by what feeds them."""
@@ -125,15 +135,15 @@ class Flattener:
             through = [
                 f"{block}.{port}"
                 for port in self.needs(block, self.eq[block].out[name])
-                if self.diagram.wires[block, port].source == following
+                if self.net.origin((block, port)) == following
             ]
             lines.append(f"  {block}.{name}  <- needs {', '.join(through)}")
         lines.append(f"  {path_of(ends[0])}")
-        return f"{self.diagram.name}: algebraic loop\n" + "\n".join(lines) + f"\n{WAYS_OUT}"
+        return f"{self.net.name}: algebraic loop\n" + "\n".join(lines) + f"\n{WAYS_OUT}"
 
     def tie(self, value: Any) -> ca.SX:
         """An expression with the parameters that are bound replaced by their expressions."""
-        bindings = self.diagram.bindings
+        bindings = {end: value for end, value in self.net.bindings.items() if end[0] in self.s}
         bound = stack(getattr(self.s[block], name) for block, name in bindings)
         tied: ca.SX = (
             ca.substitute(stack([value]), bound, stack(bindings.values())) if bindings else stack([value])
@@ -144,14 +154,14 @@ class Flattener:
 
     def states(self) -> Iterator[tuple[str, State]]:
         """Every state with the name of its block, in the order of `x`."""
-        for name, block in self.diagram.blocks.items():
+        for name, block in self.net.blocks.items():
             for state in block.declared(State).values():
                 yield name, state
 
     def unknowns(self) -> list[Unknown]:
         """Algebraic variables: those that blocks declare and those of implicit wires."""
         found = []
-        for name, block in self.diagram.blocks.items():
+        for name, block in self.net.blocks.items():
             for key, d in block.declared(Algebraic).items():
                 residual = stack([self.resolve(name, self.eq[name].alg[key])])
                 found.append(
@@ -160,8 +170,7 @@ class Flattener:
                     )
                 )
         for target, value in self.implicit.items():
-            wire = self.diagram.wires[target]
-            declared = self.diagram.blocks[target[0]].declared(Input)[target[1]]
+            wire, declared = self.net.wires[target], self.declared(target)
             symbol, fed = stack([value]), stack([self.at_end(wire.source)])
             doc = f"implicit wire from {path_of(wire.source)}"
             for k, part in enumerate(parts(path_of(target), declared.kind)):
@@ -173,13 +182,13 @@ class Flattener:
     def parameters(self) -> tuple[list[Row], ca.SX]:
         """Rows and symbols of the parameters of the diagram, then of the blocks where they are not bound."""
         rows, symbols = [], []
-        for name, shared in self.diagram.shared.items():
+        for name, shared in self.net.shared.items():
             d = shared.declared
             rows.append(Row(name, d.unit, d.value, d.bounds, d.doc, d.source))
             symbols.append(shared.symbol)
-        for name, block in self.diagram.blocks.items():
+        for name, block in self.net.blocks.items():
             for key, d in block.declared(Parameter).items():
-                if (name, key) not in self.diagram.bindings:
+                if (name, key) not in self.net.bindings:
                     value, source = block.values[key], block.sources[key]
                     rows.append(Row(f"{name}.{key}", d.unit, value, d.bounds, d.doc, source))
                     symbols.append(getattr(self.s[name], key))
@@ -188,7 +197,7 @@ class Flattener:
     def inputs(self) -> list[Row]:
         """Rows of the inputs with their values at rest."""
         rows = []
-        for name, (declared, rest) in self.diagram.inputs.items():
+        for name, (declared, rest) in self.net.inputs.items():
             rests = (rest.real, rest.imag)
             for part, value in zip(parts(name, declared.kind), rests, strict=False):
                 rows.append(Row(part, declared.unit, float(value), doc=declared.doc))
@@ -197,18 +206,32 @@ class Flattener:
     def outputs(self) -> tuple[list[Row], ca.SX]:
         """Rows and expressions of the outputs."""
         rows, values = [], []
-        for name, end in self.diagram.outputs.items():
-            declared = find(self.diagram, end)
-            assert declared is not None  # structure_problems has looked
+        for name, end in self.net.outputs.items():
+            declared = self.declared(end)
             rows += [Row(part, declared.unit, doc=declared.doc) for part in parts(name, declared.kind)]
             values.append(self.at_end(end))
         return rows, stack(values)
 
 
+def checked(diagram: Diagram) -> Netlist:
+    """The netlist of a diagram whose wiring is in order."""
+    net = netlist(diagram)
+    raise_all(structure_problems(net), diagram.name, ModelError)
+    return net
+
+
+def feedthrough(diagram: Diagram) -> dict[str, tuple[str, ...]]:
+    """See :meth:`Diagram.feedthrough`."""
+    flat = Flattener(checked(diagram))
+    return {
+        name: tuple(k for k, u in flat.u.items() if ca.depends_on(stack([flat.at_end(end)]), stack([u])))
+        for name, end in diagram.outputs.items()
+    }
+
+
 def flatten(diagram: Diagram) -> Dae:
     """Compile a diagram: see :meth:`Diagram.compile`."""
-    raise_all(structure_problems(diagram), diagram.name, ModelError)
-    flat = Flattener(diagram)
+    flat = Flattener(checked(diagram))
     unknowns = flat.unknowns()
     output_rows, y = flat.outputs()
     parameter_rows, p = flat.parameters()
@@ -221,11 +244,10 @@ def flatten(diagram: Diagram) -> Dae:
     together = ca.cse(flat.tie(stack([f, g, y])))
     nx, nz = x.numel(), z.numel()
     f, g, y = together[:nx], together[nx : nx + nz], together[nx + nz :]
-    check_regular(diagram.name, g, z, unknowns)
-
-    values = np.array([row.value for row in parameter_rows])
-    automata = tuple(build_automaton(flat, name, p, values) for name, b in diagram.blocks.items() if b.modes)
-    return Dae(
+    algebraics = tuple(unknown.row for unknown in unknowns)
+    check_regular(diagram.name, g, z, algebraics)
+    automata = tuple(build_automaton(flat, name, p) for name, b in flat.net.blocks.items() if b.modes)
+    dae = Dae(
         name=diagram.name,
         t=ca.SX.sym("t"),
         x=x,
@@ -239,57 +261,32 @@ def flatten(diagram: Diagram) -> Dae:
             Row(f"{name}.{d.name}", d.unit, d.start, d.bounds, d.doc, crossing=d.crossing)
             for name, d in flat.states()
         ),
-        algebraics=tuple(unknown.row for unknown in unknowns),
+        algebraics=algebraics,
         inputs=tuple(flat.inputs()),
         parameter_rows=tuple(parameter_rows),
         outputs=tuple(output_rows),
         automata=automata,
         start=start_values(flat, x, z, unknowns, automata),
-        notes=tuple(f"{name}: {note}" for name, block in diagram.blocks.items() for note in block.notes()),
+        notes=tuple(f"{name}: {note}" for name, block in flat.net.blocks.items() for note in block.notes()),
     )
-
-
-def check_regular(name: str, g: ca.SX, z: ca.SX, unknowns: list[Unknown]) -> None:
-    """Refuse an algebraic part in which some variable has no equation of its own to determine it."""
-    if not unknowns:
-        return
-    pattern = np.array(ca.DM(ca.jacobian(g, z).sparsity(), 1).full()) != 0
-    determines: dict[int, int] = {}  # equation -> variable; a maximum matching by augmenting paths
-
-    def assign(variable: int, tried: set[int]) -> bool:
-        for equation in (int(k) for k in np.flatnonzero(pattern[:, variable])):
-            if equation not in tried:
-                tried.add(equation)
-                if equation not in determines or assign(determines[equation], tried):
-                    determines[equation] = variable
-                    return True
-        return False
-
-    lost = [k for k in range(len(unknowns)) if not assign(k, set())]
-    if lost:
-        idle = [k for k in range(len(unknowns)) if k not in determines]
-        raise ModelError(
-            f"{name}: the algebraic part is singular. No equation determines "
-            f"{', '.join(unknowns[k].row.path for k in lost)}; left over is the equation of "
-            f"{', '.join(unknowns[k].row.path for k in idle)}. Let the equations depend on the variables "
-            "they are to determine, or make one of the variables a state."
-        )
+    raise_all(dae.chatter(dae.parameter_values()), diagram.name, ModelError)
+    return dae
 
 
 def start_values(
     flat: Flattener, x: ca.SX, z: ca.SX, unknowns: list[Unknown], automata: tuple[Automaton, ...]
 ) -> ca.SX:
     """Start values as functions of `u` and `p`: what the blocks say of their rest, through the wires."""
-    rests = {name: block.rest(flat.s[name]) for name, block in flat.diagram.blocks.items()}
+    rests = {name: block.rest(flat.s[name]) for name, block in flat.net.blocks.items()}
     problems = []
-    for name, block in flat.diagram.blocks.items():
+    for name, block in flat.net.blocks.items():
         states = block.declared(State)
         problems += [
             f"{name} ({type(block).__name__}): rest() gives {key!r}, not a state.{did_you_mean(key, states)}"
             for key in rests[name]
             if key not in states
         ]
-    raise_all(problems, flat.diagram.name, ModelError)
+    raise_all(problems, flat.net.name, ModelError)
     guesses = [
         flat.resolve(name, ca.SX(rests[name].get(state.name, state.start))) for name, state in flat.states()
     ]

@@ -18,14 +18,17 @@ class DcEnergyLoop(Block):
         P^c = \operatorname{sat}_{[0,\, \kappa \beta H |V|]}(P^u), \qquad Q^c = P^c \tan\varphi
 
     .. math::
-        \dot\xi = \kappa\, e \quad\text{unless the limit is reached and } e \text{ pushes further into it}
+        \dot\xi = h\, e \quad\text{unless the limit is reached and } e \text{ pushes further into it}
 
-    P_ref is the power drawn from the link. :math:`\kappa` is the supervisor's share of the current limit.
+    P_ref is the power drawn from the link. :math:`\kappa` is the supervisor's share of the current limit, h
+    is 1 in NORMAL. While the battery feeds the mismatch forward the integral holds: the battery makes up
+    whatever is missing, so that an integral would not find the import but drift.
     Paper: eqs. (ups_dc_error), (ups_p_command), (ups_q_command).
     Equilibrium: w = 1, xi = 0, P_c = P_ref.
     Differs: P_min = 0 and P_max = I_max |V|, which the paper leaves open: the facility never commands an
     export, nor more than the current limit lets through.
-    Differs: the conditional anti-windup, words in the paper, is a smooth gate; on battery the integral holds.
+    Differs: the conditional anti-windup, words in the paper, is a smooth gate; outside NORMAL the
+    integral holds.
     Differs: the reactive reference is the load's power factor on the active command, in a sag too; reactive
     current yields to active current in the limiter, and the grid-following mode gives no voltage support.
     """
@@ -50,6 +53,7 @@ class DcEnergyLoop(Block):
     p_ref = Input("pu(S)", "power drawn from the DC link")
     v = Input("pu(V)", "POI voltage", kind=Phasor)
     share = Input("1", "share of the current limit that the supervisor grants")
+    steady = Input("1", "1: the integral acts")
     p_c = Output("pu(S)", "active-power command")
     q_c = Output("pu(S)", "reactive-power command")
 
@@ -63,6 +67,6 @@ class DcEnergyLoop(Block):
         into_high = smooth.step(e, s.eps) * smooth.step(ask - p_max, s.eps * s.H)
         into_low = smooth.step(-e, s.eps) * smooth.step(-ask, s.eps * s.H)
         return Equations(
-            der=dict(xi=s.share * e * (1 - into_high) * (1 - into_low)),
+            der=dict(xi=s.steady * e * (1 - into_high) * (1 - into_low)),
             out=dict(p_c=p_c, q_c=p_c * smooth.root(1 / s.pf**2 - 1, 1e-6)),
         )

@@ -15,6 +15,7 @@ class DcLink(Block):
 
     Import positive, battery discharge positive. Equilibrium: the powers balance.
     Valid while the converters have voltage to work with; w is the square of the link voltage in pu.
+    The outputs `energy` (E) and `loss` are entries of the facility's energy ledger.
     Differs: the paper has no balance for its DC-link state; this is it.
     Differs: the state is w = E/E*, so that its bounds and tolerances do not depend on H.
     Differs: losses are counted in PUE, hence eta = 1 unless set; below 1 they are drawn on top of the demand.
@@ -32,6 +33,8 @@ class DcLink(Block):
     p_b = Input("pu(S)", "power from the battery")
     p_out = Input("pu(S)", "power drawn from the protected bus")
     drain = Output("pu(S)", "power drawn from the link")
+    energy = Output("pu(S) s", "energy of the link")
+    loss = Output("pu(S)", "power lost between link and protected bus")
 
     w = State(
         1.0, "1", "energy over its nominal value", bounds=(0.36, 1.44),
@@ -40,4 +43,7 @@ class DcLink(Block):
 
     def equations(self, s: Any) -> Equations:
         drain = s.p_out / s.eta
-        return Equations(der=dict(w=(s.p_g + s.p_b - drain) / (s.T_hold * s.H)), out=dict(drain=drain))
+        return Equations(
+            der=dict(w=(s.p_g + s.p_b - drain) / (s.T_hold * s.H)),
+            out=dict(drain=drain, energy=s.T_hold * s.H * s.w, loss=drain - s.p_out),
+        )

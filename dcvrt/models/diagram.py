@@ -1,38 +1,22 @@
-"""Diagram: add blocks, wire their ports, compile to one flat system."""
+"""Diagram: add parts, wire their ports, compile to one flat system."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import casadi as ca
 
 from dcvrt.dae import Dae
 from dcvrt.errors import InputError, ModelError, did_you_mean, outside
-from dcvrt.models.block import Block, Input, Parameter, Port
+from dcvrt.models.declared import D, Declared, Input, Output, Parameter, Part, Port
 from dcvrt.models.phasor import Scalar
+from dcvrt.models.wiring import End, Wire, driven_twice
 from dcvrt.units import dimension
 
-End = tuple[str, str]
-"""Block name and port name; the block name is empty for an input of the diagram. Wires hold names, not
-objects, so that `replace` keeps them."""
-
-B = TypeVar("B", bound=Block)
-
-
-def path_of(end: End) -> str:
-    """``block.port``, or the name alone for an input of the diagram."""
-    return f"{end[0]}.{end[1]}" if end[0] else end[1]
-
-
-@dataclass(frozen=True)
-class Wire:
-    """What feeds an input; `implicit` makes the wire an unknown of the system, to be solved with it."""
-
-    source: End
-    implicit: bool = False
-    start: float = 0.0
+P = TypeVar("P", bound=Part)
 
 
 @dataclass(frozen=True)
@@ -43,12 +27,15 @@ class Shared:
     declared: Parameter
 
 
-@dataclass
-class Diagram:
-    """Blocks and wires under one name.
+@dataclass(eq=False)
+class Diagram(Part):
+    """Parts and wires under one name. A part is a block, or another diagram that is used as one.
 
     Nothing is checked until `compile`, which reports every structural error at once; values given to `set`
-    and names looked up are checked on the spot.
+    and names looked up are checked on the spot. A diagram that is added to another shows its inputs, outputs
+    and parameters as ports and parameters; the paths of what is in it begin with its name there.
+
+    `doc` says in a line what it is; `page` is the prose that a sheet begins with: what it is for.
 
     >>> from dcvrt.models import Diagram, Phasor, Pll
     >>> d = Diagram("mine")
@@ -58,11 +45,22 @@ class Diagram:
     >>> d.output("omega", pll.omega)
     >>> d.compile().x_names
     ('pll.xi', 'pll.delta')
+
+    >>> site = Diagram("site")
+    >>> for name in ("one", "two"):
+    ...     part = Diagram("half")
+    ...     lock = part.add("pll", Pll())
+    ...     part.connect(part.input("v", "pu(V)", Phasor), lock.v)
+    ...     _ = site.add(name, part)
+    >>> site.connect(site.input("v_poi", "pu(V)", Phasor), site.port("one.v"), site.port("two.v"))
+    >>> site.compile().x_names
+    ('one.pll.xi', 'one.pll.delta', 'two.pll.xi', 'two.pll.delta')
     """
 
     name: str
     doc: str = ""
-    blocks: dict[str, Block] = field(default_factory=dict, init=False)
+    page: str = ""
+    blocks: dict[str, Part] = field(default_factory=dict, init=False)
     inputs: dict[str, tuple[Input, complex]] = field(default_factory=dict, init=False)
     shared: dict[str, Shared] = field(default_factory=dict, init=False)
     bindings: dict[End, Scalar] = field(default_factory=dict, init=False)
@@ -71,23 +69,29 @@ class Diagram:
     problems: list[str] = field(default_factory=list, init=False)
     """Errors of wiring seen so far; `compile` reports them with its own."""
 
+    def __post_init__(self) -> None:
+        self.title = self.name
+
     # ---- parts ----------------------------------------------------------------------------------------
 
-    def add(self, name: str, block: B) -> B:
-        """Add a block under a name, and return it."""
+    def add(self, name: str, block: P) -> P:
+        """Add a block, or a diagram as one, under a name, and return it."""
         if name in self.blocks or name in self.shared or name in self.inputs:
+            self.problems.append(f"the name {name!r} is taken. Add the second {block.label} under another.")
+        elif "." in name:
             self.problems.append(
-                f"the name {name!r} is taken. Add the second {type(block).__name__} under another."
+                f"the name {name!r} has a dot, which separates the parts of a path. Drop it."
             )
-            return block
-        if block.name:
+        elif block.home is not None:
             self.problems.append(
                 f"the block added as {name!r} is already {block.name!r} of a diagram. "
-                f"Make a second {type(block).__name__}()."
+                f"Make a second {block.anew}."
             )
-            return block
-        block.name = name
-        self.blocks[name] = block
+        elif block is self or block in self._homes():
+            self.problems.append(f"{block.label} cannot be a part of itself, here added as {name!r}.")
+        else:
+            block.name, block.home = name, self
+            self.blocks[name] = block
         return block
 
     def parameter(
@@ -155,31 +159,32 @@ class Diagram:
                     f"{target} is not an input of a block. Write connect(source, target, ...)."
                 )
             elif end in self.wires:
-                self.problems.append(
-                    f"{target} is already driven by {path_of(self.wires[end].source)}; {source} cannot "
-                    "drive it too. Drop one of the two, or add them in a block."
-                )
+                self.problems.append(driven_twice(end, self.wires[end].source, origin))
             else:
                 self.wires[end] = Wire(origin, implicit, start)
 
-    def bind(self, block: Block, **expressions: Scalar) -> None:
-        """Tie parameters of a block to expressions of the diagram's parameters."""
-        if self.blocks.get(block.name) is not block:
-            self.problems.append(f"bind: {type(block).__name__} was not added to this diagram.")
+    def bind(self, block: Part, **expressions: Scalar) -> None:
+        """Tie parameters of a part to expressions of the diagram's parameters."""
+        path = self._path(block)
+        if not path:
+            self.problems.append(f"bind: {block.label} was not added to this diagram.")
             return
         for name, expression in expressions.items():
-            self.bindings[block.name, name] = expression
+            self.bindings[path, name] = expression
 
-    def replace(self, name: str, block: B) -> B:
-        """Put another block in the place of one: wires and bindings stay, its own values come with it."""
-        self._known_block(name)
-        if block.name:
-            raise ModelError(
-                f"the block is already {block.name!r} of a diagram. Make a new {type(block).__name__}()."
-            )
-        block.name = name
-        self.blocks[name].name = ""
-        self.blocks[name] = block
+    def replace(self, name: str, block: P) -> P:
+        """Put another part in the place of one: wires and bindings stay, its own values come with it.
+
+        `name` may be a path into a diagram that is a part of this one.
+        """
+        self._known_part(name)
+        outer, _, local = name.rpartition(".")
+        owner: Any = self.part(outer) if outer else self
+        if block.home is not None:
+            raise ModelError(f"the block is already {block.name!r} of a diagram. Make a new {block.anew}.")
+        owner.blocks[local].home = None
+        block.name, block.home = local, owner
+        owner.blocks[local] = block
         return block
 
     def set(self, path: str, value: float, source: str = "set by the user") -> None:
@@ -190,64 +195,156 @@ class Diagram:
         InputError
             the name is not known, the value is outside its bounds, or the parameter is bound.
         """
-        if path in self.shared:
-            declared = self.shared[path].declared
-            low, high = declared.bounds
-            if not low <= value <= high:
-                raise InputError(outside(path, value, declared.unit, declared.bounds))
-            declared.value, declared.source = float(value), source
-            return
-        block_name, _, symbol = path.partition(".")
-        if not symbol or block_name not in self.blocks:
-            known = [
-                *self.shared,
-                *(f"{n}.{k}" for n, b in self.blocks.items() for k in b.declared(Parameter)),
-            ]
-            raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, known)}")
-        block = self.blocks[block_name]
-        if (block_name, symbol) in self.bindings:
-            raise InputError(
-                f"{path} is bound to {self.bindings[block_name, symbol]}. Set "
-                f"{' or '.join(repr(k) for k in self._behind(block_name, symbol))} instead, or bind it anew."
+        from dcvrt.models.expressions import text_of
+        from dcvrt.models.netlist import netlist
+
+        flat = netlist(self)
+        block_path, _, symbol = path.rpartition(".")
+        if (expression := flat.bindings.get((block_path, symbol))) is not None:
+            behind = [str(v) for v in ca.symvar(ca.SX(expression))]
+            instead = (
+                f"Set {' or '.join(map(repr, behind))} instead, or bind it anew."
+                if behind
+                else "Bind it anew."
             )
-        if problem := block.problem_of(symbol, value):
-            raise InputError(f"{block_name}: {problem}")
-        block.values[symbol], block.sources[symbol] = float(value), source
+            raise InputError(f"{path} is bound to {text_of(expression)}. {instead}")
+        places = flat.parameters()
+        if path not in places:
+            near = [known for known in places if known.rpartition(".")[0] == block_path]
+            raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, near or places)}")
+        declared = places[path]
+        low, high = declared.bounds
+        if not low <= value <= high:
+            raise InputError(outside(path, value, declared.unit, declared.bounds))
+        if path in flat.shared:
+            declared.value, declared.source = float(value), source
+        else:
+            block = flat.blocks[block_path]
+            block.values[symbol], block.sources[symbol] = float(value), source
 
     def port(self, path: str) -> Port:
         """The port at ``block.symbol``, or the input of the diagram of that name."""
         if path in self.inputs:
             return Port(None, self.inputs[path][0])
-        block, _, name = path.partition(".")
-        if not name:
+        block, _, name = path.rpartition(".")
+        if not block:
             raise InputError(f"{self.name} has no input {path!r}.{did_you_mean(path, self.inputs)}")
-        self._known_block(block)
-        port: Port = getattr(self.blocks[block], name)
-        return port
+        self._known_part(block)
+        part: Any = self.part(block)
+        known = {n: d for n, d in part.declared(Declared).items() if not isinstance(d, Parameter)}
+        if name in known:
+            return Port(part, known[name])
+        if name in part.declared(Parameter):
+            raise InputError(f"{path} is a parameter, not a port. Give it a value with set or bind.")
+        raise InputError(
+            f"{self.name} has no port {path!r}.{did_you_mean(path, [f'{block}.{n}' for n in known])}"
+        )
+
+    def part(self, path: str) -> Part | None:
+        """The block or diagram at a path, or None."""
+        here: Part | None = self
+        for name in path.split("."):
+            here = here.blocks.get(name) if isinstance(here, Diagram) else None
+        return here
 
     # ---- results --------------------------------------------------------------------------------------
 
-    def compile(self) -> Dae:
+    def compile(self, eliminate: bool | Sequence[str] = False) -> Dae:
         """Check everything and flatten to a :class:`Dae`.
+
+        Parameters
+        ----------
+        eliminate : algebraic variables to put in terms of the others, where their equations allow it: paths,
+            or True for all. By default every one is kept, to be solved along with the states. An eliminated
+            variable appears in the results only if it is an output.
 
         Raises
         ------
         ModelError
             structural errors, all that are visible at once: inputs without a source, units that do not match,
             inputs driven twice, algebraic loops, missing equations, a singular algebraic part, modes that
-            cannot be reached or left, thresholds without hysteresis, unknown names.
+            cannot be reached or left, thresholds without hysteresis, unknown names, a variable to eliminate
+            whose equation has no explicit solution.
         """
+        from dcvrt.models.algebraic import eliminated
         from dcvrt.models.compile import flatten
 
-        return flatten(self)
+        return eliminated(flatten(self), eliminate)
 
-    def sheet(self) -> str:
-        """Markdown with the equations, parameters, ports, modes and deviations of every block."""
+    def feedthrough(self) -> dict[str, tuple[str, ...]]:
+        """Inputs that each output depends on at once, without a state between: read from the equations."""
+        from dcvrt.models.compile import feedthrough
+
+        return feedthrough(self)
+
+    def sheet(self, form: Literal["markdown", "latex"] = "markdown") -> str:
+        """What an engineer reads before trusting it: equations, parameters, ports, modes, deviations.
+
+        Parameters
+        ----------
+        form : ``"markdown"``, or ``"latex"`` for a document that compiles on its own.
+        """
         from dcvrt.models.sheet import sheet
 
-        return sheet(self)
+        return sheet(self, form)
+
+    # ---- as a part of another diagram -----------------------------------------------------------------
+
+    @property
+    def label(self) -> str:
+        return self.title
+
+    @property
+    def anew(self) -> str:
+        return f"diagram {self.title!r}"
+
+    def declared(self, kind: type[D]) -> dict[str, D]:
+        """Its parameters, inputs and outputs, as declarations of one kind."""
+        table: dict[str, Declared] = {name: shared.declared for name, shared in self.shared.items()}
+        table |= {name: declared for name, (declared, _) in self.inputs.items()}
+        for name, end in self.outputs.items():
+            source = self._find(end)
+            if source is not None:
+                out = Output(source.unit, source.doc, kind=source.kind)
+                out.name = name
+                table[name] = out
+        return {name: d for name, d in table.items() if isinstance(d, kind)}
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "blocks" not in self.__dict__:
+            raise AttributeError(name)
+        if name in self.shared:
+            return self.shared[name].declared.value
+        known = self.declared(Declared)
+        if name not in known:
+            raise self.unknown(name)
+        return Port(self, known[name])
 
     # ---- helpers --------------------------------------------------------------------------------------
+
+    def _find(self, end: End) -> Declared | None:
+        """What stands at the end of a wire."""
+        path, name = end
+        if not path:
+            return self.inputs[name][0] if name in self.inputs else None
+        part = self.part(path)
+        return part.declared(Declared).get(name) if part is not None else None
+
+    def _homes(self) -> Iterator[Part]:
+        """The diagrams that it stands in."""
+        here = self.home
+        while here is not None:
+            yield here
+            here = here.home
+
+    def _path(self, part: Part) -> str:
+        """Path of a part within this diagram; empty when it is not in it."""
+        names: list[str] = []
+        here: Part | None = part
+        while here is not None and here is not self:
+            names.insert(0, here.name)
+            here = here.home
+        return ".".join(names) if here is self else ""
 
     def _end(self, port: Any) -> End | None:
         if not isinstance(port, Port):
@@ -261,16 +358,19 @@ class Diagram:
                 self.problems.append(f"the input {port} belongs to another diagram.")
                 return None
             return ("", port.declared.name)
-        if self.blocks.get(port.block.name) is not port.block:
+        path = self._path(port.block)
+        if not path:
             self.problems.append(
                 f"{port} belongs to a block that is not in this diagram. Add the block first."
             )
             return None
-        return (port.block.name, port.declared.name)
+        return (path, port.declared.name)
 
-    def _known_block(self, name: str) -> None:
-        if name not in self.blocks:
-            raise InputError(f"{self.name} has no block {name!r}.{did_you_mean(name, self.blocks)}")
-
-    def _behind(self, block: str, symbol: str) -> list[str]:
-        return [str(v) for v in ca.symvar(ca.SX(self.bindings[block, symbol]))] or ["the binding"]
+    def _known_part(self, path: str) -> None:
+        if self.part(path) is None:
+            outer, _, _ = path.rpartition(".")
+            inside = self.part(outer) if outer else self
+            known = inside.blocks if isinstance(inside, Diagram) else self.blocks
+            prefix = f"{outer}." if isinstance(inside, Diagram) and outer else ""
+            names = [prefix + name for name in known]
+            raise InputError(f"{self.name} has no block {path!r}.{did_you_mean(path, names)}")

@@ -31,6 +31,22 @@ def active_priority(
     return Phasor(along, across) * axis
 
 
+def reactive_priority(
+    i: Phasor, v: Phasor, i_max: Scalar, open_share: Scalar, eps: Scalar, eps_v: Scalar
+) -> Phasor:
+    """Cut `i` to |i| <= i_max, giving up current along `v` before current across `v`.
+
+    The active part is held within 0 and the share `open_share`, in [0, 1], of what the reactive part leaves.
+    As with :func:`active_priority` the limit is never exceeded, and without voltage the current is 0.
+    """
+    axis = unit_axis(v, eps_v)
+    ask = i * axis.conj()
+    across = smooth.sat(ask.im, -i_max, i_max, eps)
+    room = smooth.root(i_max * i_max - across * across, eps)
+    along = smooth.sat(ask.re, 0.0, open_share * room, eps)
+    return Phasor(along, across) * axis
+
+
 class ActivePriorityLimiter(Block):
     r"""Circular current limit that sheds reactive before active current.
 
@@ -79,3 +95,29 @@ class ActivePriorityLimiter(Block):
         i = active_priority(s.ask, s.v, limit, (0.0, top), s.eps * s.H, s.eps_v)
         asked = (s.ask * unit_axis(s.v, s.eps_v).conj()).re
         return Equations(out=dict(i=i, i_max=i_max, shortfall=asked - top))
+
+
+class ReactivePriorityLimiter(ActivePriorityLimiter):
+    r"""Circular current limit that sheds active before reactive current.
+
+    .. math::
+        i_q' = \operatorname{sat}_{\pm I}(i_q), \qquad
+        i_p' = \operatorname{sat}_{[0,\, \chi \sqrt{I^2 - i_q'^2}]}(i_p), \qquad I = \kappa\, \beta H
+
+    Same ports, parameters, kappa and chi as the limiter with active priority, which it replaces:
+    ``f.replace("lim", ReactivePriorityLimiter())``. For grid codes that put reactive support first in a sag;
+    the battery then covers the active power that yields.
+    Smoothed with width eps H; |i| never exceeds I. Algebraic: no equilibrium of its own.
+    Differs: the paper has active priority only. The DC-energy loop still takes I |V| for the largest import
+    and may wind up while reactive current holds the room.
+    """
+
+    def equations(self, s: Any) -> Equations:
+        i_max = s.beta * s.H
+        limit = s.share * i_max
+        chi = smooth.sat((s.w_full - s.w) / s.w_fade, 0.0, 1.0, s.eps)
+        i = reactive_priority(s.ask, s.v, limit, chi, s.eps * s.H, s.eps_v)
+        ask = s.ask * unit_axis(s.v, s.eps_v).conj()
+        across = smooth.sat(ask.im, -limit, limit, s.eps * s.H)
+        top = chi * smooth.root(limit * limit - across * across, s.eps * s.H)
+        return Equations(out=dict(i=i, i_max=i_max, shortfall=ask.re - top))

@@ -94,3 +94,30 @@ class FacilityLoad(Block):
     def equations(self, s: Any) -> Equations:
         other = s.cooling + s.auxiliary
         return Equations(out=dict(demand=s.it_demand + other, p=s.it + other))
+
+
+class SplitFacilityLoad(Block):
+    r"""Sum of the loads where cooling is fed beside the protected bus, not from it.
+
+    .. math::
+        P^{dc} = P^{IT} + P^{cool,\,dem} + P^{aux}, \qquad
+        P^{bus} = \sigma P^{IT} + P^{aux}, \qquad
+        P^{out} = P^{bus} + P^{cool}
+
+    Differs: the paper feeds all of the load from the protected bus, eq. (dc_dynamic_load).
+    """
+
+    it_demand = Input("pu(S)", "demand of the servers")
+    it = Input("pu(S)", "power drawn by the servers")
+    auxiliary = Input("pu(S)", "auxiliary power")
+    cooling_demand = Input("pu(S)", "power that the cooling asks for")
+    cooling = Input("pu(S)", "power that the cooling gets")
+    demand = Output("pu(S)", "facility demand P^dc, the power it would draw with everything healthy")
+    p = Output("pu(S)", "power drawn from the protected bus")
+    served = Output("pu(S)", "power that all loads get")
+
+    def equations(self, s: Any) -> Equations:
+        p = s.it + s.auxiliary
+        return Equations(
+            out=dict(demand=s.it_demand + s.auxiliary + s.cooling_demand, p=p, served=p + s.cooling)
+        )

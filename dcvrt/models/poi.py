@@ -31,6 +31,36 @@ class Poi(Block):
         return Equations(out=dict(p=power.re, q=power.im, i_mag=smooth.mag(s.i, s.eps)))
 
 
+class SharedPoi(Block):
+    r"""Point of interconnection that feeds a UPS and, beside it, loads of their own.
+
+    .. math::
+        P^g + jQ^g = V (I_{ups} + I_{direct})^{*}, \qquad I_{max} = I_{max,ups} + I_{max,direct}
+
+    Import positive. Algebraic. I_max bounds the current of the site, not of one converter.
+    Differs: the paper has no load beside the UPS.
+    """
+
+    eps = Parameter(1e-6, "pu(I)", (1e-9, 1e-2), "rounding of |i| at 0", "own choice: numerics")
+
+    v = Input("pu(V)", "POI voltage, network frame", kind=Phasor)
+    ups = Input("pu(I)", "current of the UPS, network frame", kind=Phasor)
+    direct = Input("pu(I)", "current of the loads beside it, network frame", kind=Phasor)
+    ups_max = Input("pu(I)", "largest current of the UPS")
+    direct_max = Input("pu(I)", "largest current of the loads beside it")
+    p = Output("pu(S)", "active-power import")
+    q = Output("pu(S)", "reactive-power import")
+    i_mag = Output("pu(I)", "magnitude of the current")
+    i_max = Output("pu(I)", "largest current of the site")
+
+    def equations(self, s: Any) -> Equations:
+        i = s.ups + s.direct
+        power = s.v * i.conj()
+        return Equations(
+            out=dict(p=power.re, q=power.im, i_mag=smooth.mag(i, s.eps), i_max=s.ups_max + s.direct_max)
+        )
+
+
 class VoltageFilter(Block):
     r"""Measured magnitude of the POI voltage.
 

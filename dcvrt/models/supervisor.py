@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from dcvrt.models.automaton import Go, above, always, below, outside, within
 from dcvrt.models.block import Block, Equations, Input, Output, Parameter
+from dcvrt.models.command import given, withdrawn
 
 ILLUSTRATIVE = "illustrative: the figure of the regions prints no thresholds"
 
@@ -63,7 +65,7 @@ class Supervisor(Block):
     share = Output("1", "share of the current limit")
     assist = Output("1", "battery feeds the power mismatch forward")
     charge = Output("1", "battery may recharge")
-    trim = Output("1", "1 while reactive set points may be trimmed")
+    trim = Output("1", "1 in NORMAL: integrals and slow trims may act")
     resync = Output("1", "1 while the control frame is aligned without load")
     mode = Output("1", "number of the mode, from 0")
 
@@ -93,3 +95,23 @@ class Supervisor(Block):
                 mode=s.number,
             )
         )
+
+
+class SupervisorWithLockout(Supervisor):
+    """Supervisor that stays on battery while a lock, such as that of a sag counter, keeps the grid out.
+
+    Modes, thresholds and outputs are those of the plain supervisor. While `lock` is 1 every coupled mode
+    leaves for BATTERY at once, and BATTERY does not end; when it is 0 again, the healthy time T_stable starts
+    to count and the return is as ever.
+    Differs: no lock-out in the paper. Sites are told to have left the grid so after a series of dips.
+    """
+
+    lock = Input("1", "1 while the facility must stay on its battery, else 0")
+
+    def transitions(self, s: Any) -> tuple[Go, ...]:
+        leave = tuple(Go(mode, "BATTERY", given(s.lock)) for mode in ("NORMAL", "MIXED", "RETURN"))
+        rows = (
+            replace(row, when=row.when & withdrawn(s.lock)) if row.source == "BATTERY" else row
+            for row in super().transitions(s)
+        )
+        return (*leave, *rows)

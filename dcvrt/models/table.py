@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from math import nan
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from dcvrt.dae import Array, Automaton, Transition
+from dcvrt.dae import Automaton, Gap, Transition
 from dcvrt.errors import ModelError, did_you_mean, raise_all
-from dcvrt.models.automaton import check_hysteresis, check_table
+from dcvrt.models.automaton import check_table, gaps
 from dcvrt.models.block import State
 
 if TYPE_CHECKING:
     from dcvrt.models.compile import Flattener
 
 
-def build_automaton(flat: Flattener, name: str, p: ca.SX, values: Array) -> Automaton:
-    """The automaton of one block; `values` are those of the parameters `p`, for the check of the limits."""
-    block, s = flat.diagram.blocks[name], flat.s[name]
+def build_automaton(flat: Flattener, name: str, p: ca.SX) -> Automaton:
+    """The automaton of one block."""
+    block, s = flat.net.blocks[name], flat.s[name]
     rows = block.transitions(s)
-    who = f"{flat.diagram.name}: {name} ({type(block).__name__})"
+    who = f"{flat.net.name}: {name} ({block.label})"
     short = shortener(name)
-    raise_all(check_table(block.modes, block.start, rows), who, ModelError)
+    problems = check_table(block.modes, block.start, rows)
+    raise_all(problems, who, ModelError)
 
-    def number(limit: Any) -> float:
-        """Value of a limit; NaN, which compares as never apart, for one that varies in time."""
-        tied = flat.tie(limit)
-        return nan if varies(tied, p) else float(ca.Function("limit", [p], [tied])(values))
-
-    problems = [short(problem) for problem in check_hysteresis(rows, number)]
     states = list(block.declared(State))
     for row in rows:
         step = f"{row.source} -> {row.target}"
@@ -47,6 +41,15 @@ def build_automaton(flat: Flattener, name: str, p: ca.SX, values: Array) -> Auto
 
     positions = {state.name: k for k, (owner, state) in enumerate(flat.states()) if owner == name}
     flags: Any = ca.vertcat(*[getattr(s, flag) for flag in block.flags])
+
+    def of_parameters(value: Any) -> ca.SX | None:
+        """A value in terms of the parameters, or None where it varies."""
+        tied = settled(value)
+        others = ca.vertcat(ca.SX(0, 1), *[v for v in ca.symvar(tied) if varies(v, p)])
+        if not ca.jacobian(tied, others).is_zero():
+            return None
+        constant: ca.SX = ca.substitute(tied, others, ca.SX.zeros(others.numel()))
+        return constant
 
     def settled(value: Any) -> ca.SX:
         return flat.tie(flat.resolve(name, ca.SX(value)))
@@ -69,6 +72,14 @@ def build_automaton(flat: Flattener, name: str, p: ca.SX, values: Array) -> Auto
                 reset={positions[key]: settled(value) for key, value in row.reset.items()},
             )
             for row in rows
+        ),
+        gaps=tuple(
+            Gap(
+                (short(gap.rows[0]), short(gap.rows[1])),
+                gap.width,
+                tuple((short(n), v) for n, v in gap.limits),
+            )
+            for gap in gaps(rows, of_parameters)
         ),
     )
 

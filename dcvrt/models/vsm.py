@@ -5,10 +5,9 @@ from __future__ import annotations
 from math import pi
 from typing import Any
 
-import casadi as ca
-
 from dcvrt.models import smooth
 from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
+from dcvrt.models.internal_voltage import effective_command, internal_voltage_at_rest, virtual_current
 from dcvrt.models.phasor import Phasor
 
 
@@ -91,11 +90,9 @@ class Vsm(Block):
 
     def equations(self, s: Any) -> Equations:
         v_dq = s.v.turn(-s.delta)
-        i = (v_dq - Phasor(s.E, 0.0)) * s.H / Phasor(s.R_v, s.X_v)
+        i = virtual_current(v_dq, s.E, s.H, Phasor(s.R_v, s.X_v))
         q_u = (v_dq * i.conj()).im
-        limited = smooth.step(s.shortfall, s.eps * s.H)
-        unmet = smooth.pos(s.p_c - s.p_g, s.eps * s.H)
-        p_eff = s.p_c + s.resync * (s.p_g - s.p_c) - (1 - s.resync) * limited * unmet
+        p_eff = effective_command(s.p_c, s.p_g, s.shortfall, s.resync, s.eps * s.H)
         droop = s.E_0 + s.K_Q * (s.q_g - s.q_c) / s.H
         omega_B = 2 * pi * s.f_B
         return Equations(
@@ -110,7 +107,5 @@ class Vsm(Block):
 
     def rest(self, s: Any) -> dict[str, Any]:
         """Internal voltage at which the unlimited current draws the commanded power."""
-        i = (Phasor(s.p_c, s.q_c) / s.v).conj()
-        internal = s.v - i * Phasor(s.R_v, s.X_v) / s.H
-        magnitude = ca.sqrt(internal.abs2())
-        return dict(omega=1.0, delta=internal.angle(), E=magnitude, E_0=magnitude)
+        magnitude, angle = internal_voltage_at_rest(s.v, s.p_c, s.q_c, s.H, Phasor(s.R_v, s.X_v))
+        return dict(omega=1.0, delta=angle, E=magnitude, E_0=magnitude)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import re
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcvrt.errors import InputError, did_you_mean
+from dcvrt import scenarios
+from dcvrt.errors import InputError, did_you_mean, raise_all
 from dcvrt.studies.outputs import refuse_unusable, write_atomically
 
 if TYPE_CHECKING:
@@ -17,16 +18,14 @@ if TYPE_CHECKING:
     from dcvrt.waveform import Waveform
 
 
-def ride(
-    variant: str, waveform: str, beta: float, out: Path | None, named: Sequence[str]
-) -> tuple[str, bool]:
+def ride(variant: str, waveform: str, parameters: Mapping[str, float], out: Path | None) -> tuple[str, bool]:
     """Run a variant on a waveform.
 
     Parameters
     ----------
     variant : name of a facility variant.
-    waveform : path of a CSV file, or one of `named`.
-    beta : converter rating over hosted capacity.
+    waveform : path of a CSV file, or name of a scenario.
+    parameters : values that differ from the variant's own, as `beta`.
     out : folder for `signals.csv` and `signals.svg`, made when it is not there.
 
     Returns
@@ -46,9 +45,10 @@ def ride(
     if out is not None:
         refuse_unusable(out)
     simulator = Simulator(facility.get(variant).compile(), save_at=1e-3)
-    run = simulator.attempt(waveform_of(waveform, named), H=1.0, beta=beta)
+    run = simulator.attempt(waveform_of(waveform), None, **{"H": 1.0, **parameters})
+    given = ", ".join(f"{name} {value:g}" for name, value in parameters.items())
     lines = [
-        f"{variant} on {run.name}, beta {beta:g}, on the base of its own capacity",
+        f"{variant} on {run.name}, {given}, on the base of its own capacity",
         f"status: {run.status}",
     ]
     if run.completed:
@@ -67,8 +67,34 @@ def ride(
     return "\n".join(lines), run.completed
 
 
-def waveform_of(name: str, named: Sequence[str]) -> Waveform:
-    """A waveform by its name or from a CSV file.
+def parameters_of(beta: float, settings: Sequence[str]) -> dict[str, float]:
+    """Parameters from `beta` and texts NAME=VALUE.
+
+    Raises
+    ------
+    InputError
+        texts of another form, values that are no number, a name that stands twice.
+    """
+    found, problems = {"beta": beta}, []
+    for text in settings:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        try:
+            number = float(value) if equals and name else math.nan
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            problems.append(f"--set {text}: write NAME=VALUE with a number, for example --set sup.T_dip=2.5.")
+        elif name in found:
+            way_out = "use --beta" if name == "beta" else "give it once"
+            problems.append(f"--set {text}: {name} has a value already. Way out: {way_out}.")
+        else:
+            found[name] = number
+    raise_all(problems, "ride")
+    return found
+
+
+def waveform_of(name: str) -> Waveform:
+    """A waveform by the name of its scenario or from a CSV file.
 
     Raises
     ------
@@ -77,15 +103,12 @@ def waveform_of(name: str, named: Sequence[str]) -> Waveform:
     """
     from dcvrt.waveform import Waveform
 
-    if name == "ercot-style":
-        return Waveform.ercot_style()
-    sag = re.fullmatch(r"sag-(\d+)", name)
-    if sag and name in named:
-        return Waveform.sag(retained=int(sag[1]) / 100, start=0.1, length=0.15, until=3.0)
+    if name in scenarios.names():
+        return scenarios.get(name)
     path = Path(name)
     if not path.is_file():
         raise InputError(
-            f"waveform {name!r}: no such file and no such test waveform.{did_you_mean(name, named)}"
+            f"waveform {name!r}: no such file and no such scenario.{did_you_mean(name, scenarios.names())}"
         )
     return Waveform.from_csv(path)
 

@@ -124,6 +124,22 @@ def decay() -> Dae:
     return s.dae({"x": -q[0] * z}, {"z_out": z, "x_out": x}, [z - s.p["k"] * x**3 - x])
 
 
+def crossed() -> Dae:
+    """Two decays whose algebraic variables change places with the mode: pivots of one are zero in the other.
+
+    x' = -z_x, y' = -2 z_y; z_x, z_y are x, y before t_s and y, x after it.
+    """
+    s = Sketch({"x": 1.0, "y": 2.0}, {"t_s": 0.3}, ["z_x", "z_y"])
+    q, _, rows = s.automaton("sup", {"straight": (1.0, 0.0), "crossed": (0.0, 1.0)}, "straight")
+    rows.append(go("straight", "crossed", s.t - s.p["t_s"]))
+    (x, y), (a, b) = s.x.values(), s.z.values()
+    return s.dae(
+        {"x": -a, "y": -2 * b}, {"x_out": x, "y_out": y, "a_out": a},
+        [q[0] * a + q[1] * b - x, q[1] * a + q[0] * b - y],
+        start={"z_x": 1.0, "z_y": 2.0},
+    )  # fmt: skip
+
+
 def flat(until: float = 1.0) -> Waveform:
     """Healthy voltage."""
     return Waveform.segments([(0.0, 1.0)], until=until)

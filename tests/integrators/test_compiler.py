@@ -15,7 +15,7 @@ import pytest
 
 from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError
-from dcvrt.integrators import NoCompilerWarning, Simulator, compiler, find_compiler
+from dcvrt.integrators import Casadi, NoCompilerWarning, Simulator, compiler, find_compiler
 from tests.integrators.systems import ball, flat
 
 
@@ -98,9 +98,9 @@ def test_a_cache_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: pyte
 
 
 def test_without_a_compiler_the_interpreter_is_announced_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    with_compiler = Simulator(ball(), start="given")(flat(1.0))
+    with_compiler = Simulator(ball(), Casadi("erk"), start="given")(flat(1.0))
     monkeypatch.setenv("CC", "none")
-    compiler._say_interpreted.cache_clear()
+    compiler.say_interpreted.cache_clear()
     simulator = Simulator(ball(), start="given")
     with pytest.warns(NoCompilerWarning, match="No C compiler was found"):
         run = simulator(flat(1.0))

@@ -1,4 +1,8 @@
-"""Hybrid semantics: which row fires when, and what its time depends on - all in closed form."""
+"""Hybrid semantics: which row fires when, and what its time depends on - all in closed form.
+
+(g), the hysteresis that is checked when a table is built or its limits are set, is tested with the tables of
+the kit; several automata wired from blocks are in test_automata.py.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,26 @@ import pytest
 
 from dcvrt.dae import Dae
 from dcvrt.errors import SimulationError
-from dcvrt.integrators import Casadi, Simulator
+from dcvrt.integrators import Casadi, Kernel, Simulator, find_compiler, simulator
 from dcvrt.waveform import Waveform
 from tests.integrators.systems import Sketch, ball, decay, flat, go, store
 
 TIGHT = 1e-10, 1e-12
-SOLVERS = [Casadi(p, *TIGHT) for p in ("erk", "rosenbrock", "cvodes")]  # type: ignore[arg-type]
+SOLVERS = [Kernel("dp5", *TIGHT), *(Casadi(p, *TIGHT) for p in ("erk", "rosenbrock", "cvodes"))]  # type: ignore[arg-type]
+BACKENDS = {"kernel": Kernel("dp5", *TIGHT), "casadi": Casadi("erk", *TIGHT)}
+
+
+def name(solver: Casadi | Kernel) -> str:
+    return solver.plugin if isinstance(solver, Casadi) else f"kernel {solver.method}"
+
+
+@pytest.fixture(params=["kernel", "casadi"], autouse=True)
+def tight(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Casadi | Kernel:
+    """Every test runs on both backends: the default one is set, the tight one is handed out."""
+    if request.param == "kernel" and find_compiler() is None:
+        pytest.skip("no C compiler here")
+    monkeypatch.setattr(simulator, "KERNEL_BY_DEFAULT", request.param == "kernel")
+    return BACKENDS[request.param]
 
 
 def timer(guard_level: float = 0.9, held: object = 0.1, **extra: float) -> tuple[Sketch, list]:
@@ -102,12 +120,12 @@ def test_held_starts_and_lapses_between_samples_on_a_ramp() -> None:
     assert event.time == pytest.approx(0.12 + 0.05, abs=1e-11)
 
 
-def test_time_of_a_timer_depends_on_held_and_on_the_time_it_started() -> None:
+def test_time_of_a_timer_depends_on_held_and_on_the_time_it_started(tight: Casadi | Kernel) -> None:
     s = Sketch({"x": 0.0}, {"T": 0.1, "w": 2.0, "E": 0.5})
     q, _, rows = s.automaton("sup", {"idle": (1.0,), "fired": (0.0,)}, "idle")
     rows.append(go("idle", "fired", s.x["x"] - s.p["E"], s.p["T"]))
     dae = s.dae({"x": q[0] * s.p["w"]}, {"x_out": s.x["x"]})
-    run = Simulator(dae, Casadi("erk", *TIGHT), wrt=("T", "w", "E"), start="given")(flat())
+    run = Simulator(dae, tight, wrt=("T", "w", "E"), start="given")(flat())
     (event,) = run.events  # E / w + T
     assert event.time == pytest.approx(0.35, abs=1e-12)
     assert event.grad == pytest.approx({"T": 1.0, "w": -0.125, "E": 0.5}, abs=1e-9)
@@ -131,13 +149,11 @@ def test_a_dip_between_two_samples_is_not_stepped_over() -> None:
     assert v.at(event.time).real == pytest.approx(0.91, abs=1e-10)
 
 
-def test_clock_starts_at_zero_in_each_mode() -> None:
+def test_clock_starts_at_zero_in_each_mode(tight: Casadi | Kernel) -> None:
     s = Sketch({"x": 0.0}, {"T": 0.3})
     _, clock, rows = s.automaton("sup", {"a": (0.0,), "b": (0.0,)}, "a")
     rows += [go("a", "b", 1.0, s.p["T"]), go("b", "a", 1.0, s.p["T"])]
-    run = Simulator(
-        s.dae({"x": clock}, {"x_out": s.x["x"]}), Casadi("erk", *TIGHT), wrt=("T",), start="given"
-    )(flat())
+    run = Simulator(s.dae({"x": clock}, {"x_out": s.x["x"]}), tight, wrt=("T",), start="given")(flat())
     assert [e.time for e in run.events] == pytest.approx([0.3, 0.6, 0.9], abs=1e-12)
     assert run["x_out"][-1] == pytest.approx((3 * 0.3**2 + 0.1**2) / 2, abs=1e-11)
     # d/dT of 3 T^2/2 + (1 - 3 T)^2/2
@@ -207,7 +223,7 @@ def test_a_time_stands_at_most_twice() -> None:
 # ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.plugin)
+@pytest.mark.parametrize("solver", SOLVERS, ids=name)
 def test_bouncing_ball(solver: Casadi) -> None:
     g, e, h0 = 9.81, 0.8, 1.0
     run = Simulator(ball(), solver, wrt=("g", "e", "h0"), start="given")(flat(2.0))
@@ -231,7 +247,7 @@ def test_bouncing_ball(solver: Casadi) -> None:
         assert run.sens["height", name][-1] == pytest.approx((up - down) / 2e-6, rel=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.plugin)
+@pytest.mark.parametrize("solver", SOLVERS, ids=name)
 def test_energy_guards(solver: Casadi) -> None:
     """Drained from the dip on, refilled, drained: a saw tooth with every corner known."""
     run = Simulator(store(), solver, wrt=("P", "R", "E_min", "E_max"))(Waveform.sag(0.5, 0.1, 2.0, until=1.2))

@@ -17,6 +17,7 @@ from dcvrt.dae import Dae, Row
 from dcvrt.errors import InputError, ModelError, SimulationError
 from dcvrt.integrators import Casadi, Simulator
 from dcvrt.integrators.run import Run
+from dcvrt.models import Diagram, Phasor
 from dcvrt.trajectory import Trajectory
 from dcvrt.waveform import Waveform
 from tests.integrators.systems import Sketch, ball, decay, flat
@@ -101,10 +102,12 @@ def test_no_equilibrium_names_the_largest_residuals() -> None:
     with pytest.raises(SimulationError) as error:
         Simulator(ball())(flat())
     assert str(error.value) == (
-        "sketch: no equilibrium at the first value of the waveform. Largest residuals:\n"
-        "  d(w)/dt = -9.81\n  d(h)/dt = 0\n"
-        "Check that the facility can import its load before the disturbance (beta V must exceed the load "
-        "factor d), and the start values."
+        "sketch: no equilibrium at the first value of the waveform. "
+        "Largest residuals in mode ball falling:\n"
+        "  d(w)/dt = -9.81 1/s\n  d(h)/dt = 0 1/s\n"
+        "Ways out: parameters or an input at which these equations can all be zero (a facility must be able "
+        "to import its load before the disturbance: beta |V| above the load factor d); better start values "
+        "(State(start), rest()); start='given' for a system that never rests."
     )
 
 
@@ -475,3 +478,14 @@ def test_any_disturbance_agrees_with_the_reference(seed: int) -> None:
     for name in ("v_it", "p_g", "w_dc"):
         size = max(1.0, values["H"]) if name == "p_g" else 1.0
         assert np.abs(run.at(name, times) - reference.at(name, times)).max() < 1e-3 * size
+
+
+def test_a_system_without_states_is_refused() -> None:
+    d = Diagram("still")
+    v = d.input("v_poi", "pu(V)", Phasor)
+    d.output("v", v)
+    with pytest.raises(ModelError) as error:
+        Simulator(d.compile())(Waveform.sag(0.5, 0.1, 0.1, 1.0))
+    assert str(error.value) == (
+        "still has no states: there is nothing to integrate. Way out: add a block with a state."
+    )

@@ -132,7 +132,7 @@ def test_thresholds_without_hysteresis_are_refused():
     with pytest.raises(ModelError) as error:
         compiled(Switch(), down=0.6)
     assert str(error.value) == (
-        "d: b (Switch): 'LOW -> HIGH: v > up' and 'HIGH -> LOW: v < down held T' leave no gap between them "
+        "d: b: 'LOW -> HIGH: v > up' and 'HIGH -> LOW: v < down held T' leave no gap between them "
         "(up = 0.6, down = 0.6): the modes would chatter. "
         "Set the limit of the way back beyond that of the way out."
     )
@@ -149,6 +149,88 @@ def test_hysteresis_of_the_supervisor_is_checked_with_its_present_values():
     d.set("sup.V_back", 0.89)
     with pytest.raises(ModelError, match=r"leave no gap between them .*V_dip = 0.9.*V_back = 0.89"):
         d.compile()
+
+
+def test_values_of_a_run_that_take_the_hysteresis_away_are_refused_before_it():
+    from dcvrt import Simulator, Waveform, facility
+    from dcvrt.errors import InputError
+
+    dae = facility.gfl().compile()
+    simulator, sag = Simulator(dae), Waveform.sag(0.7, 0.1, 0.1, until=0.3)
+    told = (
+        "gfl: sup: 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' and "
+        "'MIXED -> NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap between "
+        "them (V_dip = 0.9, V_back = 0.86): the modes would chatter. "
+        "Set the limit of the way back beyond that of the way out."
+    )
+    for call in (
+        lambda: simulator(sag, **{"sup.V_back": 0.86}),
+        lambda: simulator.equilibrium(1.0, **{"sup.V_back": 0.86}),
+        lambda: dae.parameter_values(**{"sup.V_back": 0.86}),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        assert str(error.value) == told
+    both = {"sup.V_back": 0.86, "sup.V_dip": 0.8}  # the gap counts, not the single values
+    assert simulator(sag, **both).completed
+
+
+class Follower(Switch):
+    """Limits that vary in time, a fixed distance apart."""
+
+    ref = Input("1", "reference")
+    gap = Parameter(0.1, "1", (-1, 1), "distance of the limits")
+
+    def transitions(self, s):
+        return (Go("LOW", "HIGH", above(s.v, s.ref)), Go("HIGH", "LOW", below(s.v, s.ref - s.gap)))
+
+
+def following(block, **values):
+    d = Diagram("d")
+    v, ref = d.input("v", "1"), d.input("ref", "1")
+    b = d.add("b", block)
+    d.connect(v, b.v)
+    d.connect(ref, b.ref)
+    for name, value in values.items():
+        d.set(f"b.{name}", value)
+    return d.compile()
+
+
+def test_the_distance_of_limits_that_move_together_is_checked():
+    assert [gap.rows for gap in following(Follower()).automata[0].gaps] == [
+        ("LOW -> HIGH: v > ref", "HIGH -> LOW: v < ref - gap")
+    ]
+    with pytest.raises(ModelError) as error:
+        following(Follower(), gap=-0.1)
+    assert str(error.value) == (
+        "d: b: 'LOW -> HIGH: v > ref' and 'HIGH -> LOW: v < ref - gap' leave no gap between them "
+        "(gap = -0.1): the modes would chatter. Set the limit of the way back beyond that of the way out."
+    )
+
+
+def test_limits_that_vary_on_their_own_are_left_to_the_run():
+    class Free(Follower):
+        """Nothing can be said of the distance before a run."""
+
+        def transitions(self, s):
+            return (Go("LOW", "HIGH", above(s.v, s.ref)), Go("HIGH", "LOW", below(s.v, s.down)))
+
+    assert following(Free()).automata[0].gaps == ()
+
+
+def test_guards_on_different_signals_that_can_be_true_together_are_refused():
+    class Blind(Follower):
+        """Leaves on one signal, comes back on another."""
+
+        def transitions(self, s):
+            return (Go("LOW", "HIGH", above(s.v, s.up)), Go("HIGH", "LOW", below(s.ref, s.down)))
+
+    with pytest.raises(ModelError) as error:
+        following(Blind())
+    assert str(error.value) == (
+        "d: b: 'LOW -> HIGH: v > up' and 'HIGH -> LOW: ref < down' leave no gap between them (up = 0.6, "
+        "down = 0.4): the modes would chatter. Set the limit of the way back beyond that of the way out."
+    )
 
 
 def test_a_dwell_time_must_not_depend_on_signals():

@@ -16,12 +16,16 @@ from dcvrt.models import (
     ActivePriorityLimiter,
     AuxiliaryLoad,
     Bess,
+    BessWithLosses,
     Block,
+    ContactorCooling,
     Cooling,
     CurrentLag,
     CurrentReference,
     DcEnergyLoop,
     DcLink,
+    DriveCooling,
+    Droop,
     FacilityLoad,
     Input,
     ItLoad,
@@ -31,9 +35,12 @@ from dcvrt.models import (
     Pll,
     Poi,
     ProtectedBus,
+    ReactiveSupport,
     ServerSupply,
+    SplitCooling,
     State,
     Supervisor,
+    TrainingLoad,
     VoltageFilter,
     Vsm,
 )
@@ -71,9 +78,9 @@ def symbolic(block):
     s = block.symbols("b")
     names = [n for n, d in block._declared.items() if isinstance(d, (Input, State))]
     names += [*block.flags, "clock"] if block.modes else []
-    variables = ca.vertcat(*[part for n in names for part in scalars(block, n, getattr(s, n))])
-    parameters = ca.vertcat(*[getattr(s, n) for n in block.declared(Parameter)])
-    out = ca.vertcat(*results(block.equations(s)))
+    variables = ca.SX(ca.vertcat(*[part for n in names for part in scalars(block, n, getattr(s, n))]))
+    parameters = ca.SX(ca.vertcat(*[getattr(s, n) for n in block.declared(Parameter)]))
+    out = ca.SX(ca.vertcat(*results(block.equations(s))))
     jacobian = ca.jacobian(out, variables)
     return names, ca.Function("b", [variables, parameters], [out, jacobian])
 
@@ -131,9 +138,30 @@ FEEDTHROUGH = {
     CurrentLag: {"i": {"delta"}},
     Poi: {"p": {"v", "i"}, "q": {"v", "i"}, "i_mag": {"i"}},
     Cooling: {"p": set()},
-    DcLink: {"drain": {"p_out"}},
+    DcLink: {"drain": {"p_out"}, "energy": set(), "loss": {"p_out"}},
     DcEnergyLoop: {"p_c": {"w", "p_ref", "v", "share"}, "q_c": {"w", "p_ref", "v", "share"}},
     Vsm: {"i": {"v"}, "v_dq": {"v"}, "error": {"v"}},
+    Droop: {
+        "i": {"v", "q_c"},
+        "v_dq": {"v"},
+        "error": {"v"},
+        "omega": {"p_c", "shortfall", "resync"},
+        "E": {"q_c"},
+    },
+    DriveCooling: {
+        "p": set(),
+        "i": {"v"},
+        "i_max": set(),
+        "demand": set(),
+        "energy": set(),
+        "loss": set(),
+        "mode": set(),
+    },
+    ContactorCooling: {"p": set(), "demand": set(), "mode": set()},
+    SplitCooling: {"p": set()},
+    TrainingLoad: {"p": {"g_it"}},
+    ReactiveSupport: {"q": {"q_c", "v_f"}},
+    BessWithLosses: {"energy": set(), "loss": set()},
     Supervisor: {
         "share": set(),
         "assist": set(),
@@ -369,7 +397,7 @@ def test_dc_link_draws_losses_on_top():
 
 def loop_at(**changes):
     loop = DcEnergyLoop(eps=1e-6)
-    values = dict(w=1.0, xi=0.0, p_ref=0.9, v=Phasor(1.0, 0.0), share=1.0) | changes
+    values = dict(w=1.0, xi=0.0, p_ref=0.9, v=Phasor(1.0, 0.0), share=1.0, steady=1.0) | changes
     return loop, loop.equations(loop.at(**values))
 
 
@@ -397,7 +425,7 @@ def test_dc_loop_integral_stops_only_where_it_would_wind_up():
     assert loop_at(w=0.8)[1].der["xi"] == approx(0.0, abs=1e-9)  # wants more, gets no more
     assert loop_at(w=1.4)[1].der["xi"] == approx(0.0, abs=1e-9)  # wants less than nothing
     assert loop_at(w=1.01, xi=0.5)[1].der["xi"] == approx(-0.01)  # limited above, but unwinding
-    assert loop_at(w=0.9, share=0.0)[1].der["xi"] == 0.0  # on battery it holds
+    assert loop_at(w=0.9, steady=0.0)[1].der["xi"] == 0.0  # while the battery makes up the balance it holds
 
 
 def bess_rates(**changes):

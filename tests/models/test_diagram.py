@@ -13,12 +13,15 @@ from dcvrt.models import (
     CurrentReference,
     Diagram,
     Equations,
+    Go,
     Input,
     Output,
     Parameter,
     Phasor,
     Pll,
     State,
+    above,
+    below,
 )
 
 
@@ -201,9 +204,9 @@ def test_unconnected_inputs_are_listed_with_what_could_feed_them():
         "It could be fed by: v_poi, ref.v_dq.\n"
         "  ref.delta [rad, float] is not connected (angle of the dq frame). It could be fed by: pll.delta.\n"
         "  ref.p_c [pu(S), float] is not connected (active-power command). "
-        "Nothing in the diagram has this unit and kind.\n"
+        "Nothing in the diagram has this unit and kind: add a block that gives it, or an input().\n"
         "  ref.q_c [pu(S), float] is not connected (reactive-power command). "
-        "Nothing in the diagram has this unit and kind."
+        "Nothing in the diagram has this unit and kind: add a block that gives it, or an input()."
     )
 
 
@@ -310,7 +313,10 @@ def test_unknown_and_foreign_bindings():
     d, _, pll = wired()
     d.bind(pll, K_p=2 * ca.SX.sym("G"))
     d.parameter("H", 1.0, "pu(S)")
-    assert refusal(d) == ("d: pll.K_p is bound to (2.*G); G is not a parameter of the diagram. Known: H.")
+    assert refusal(d) == (
+        "d: pll.K_p is bound to 2*G; G is not a parameter of the diagram. "
+        "Bind to what parameter() returned. Known: H."
+    )
     d, _, pll = wired()
     H = d.parameter("H", 1.0, "pu(S)")
     d.bind(pll, K_p=H)
@@ -428,11 +434,11 @@ def test_set_checks_on_the_spot():
     d.set("H", 2.0)
     assert d.compile().parameter_values().tolist() == [2.0, 10.0]
     for path, value, text in (
-        ("pll.Kp", 1.0, "pll: there is no parameter 'Kp'. Did you mean 'K_p'? Known: K_p, K_i."),
-        ("pl.K_p", 1.0, "d has no parameter 'pl.K_p'. Did you mean 'pll.K_p'? Known: H, pll.K_p, pll.K_i."),
-        ("pll.K_p", 0.0, "pll: K_p = 0 rad/s/pu(V) is outside [1, 500]."),
+        ("pll.Kp", 1.0, "d has no parameter 'pll.Kp'. Did you mean 'pll.K_p'? Known: pll.K_p."),
+        ("pl.K_p", 1.0, "d has no parameter 'pl.K_p'. Did you mean 'pll.K_p'? Known: H, pll.K_p."),
+        ("pll.K_p", 0.0, "pll.K_p = 0 rad/s/pu(V) is outside [1, 500]."),
         ("H", 3.0, "H = 3 is outside [0, 2]."),
-        ("pll.K_i", 3.0, "pll.K_i is bound to (1400*H). Set 'H' instead, or bind it anew."),
+        ("pll.K_i", 3.0, "pll.K_i is bound to 1400*H. Set 'H' instead, or bind it anew."),
     ):
         with pytest.raises(InputError) as error:
             d.set(path, value)
@@ -513,3 +519,251 @@ def test_deviations_from_the_paper_are_collected():
     d = Diagram("d")
     d.connect(d.input("u", "1"), d.add("g", Odd()).u)
     assert d.compile().notes == ("g: the gain is ours.", "g: so is the name.")
+
+
+# ---- units of bindings ------------------------------------------------------------------------------------
+
+
+class Rated(Block):
+    """Parameters of every per-unit kind."""
+
+    v_max = Parameter(1.0, "pu(V)", (0, 10), "voltage")
+    i_max = Parameter(1.0, "pu(I)", (0, 10), "current")
+    p_max = Parameter(1.0, "pu(S)", (0, 10), "power")
+    z = Parameter(1.0, "pu(V)/pu(I)", (0, 10), "impedance")
+    K = Parameter(60.0, "rad/s/pu(V)", (0, 1e3), "gain")
+    y = Output("1", "out")
+
+    def equations(self, s):
+        return Equations(out={"y": s.v_max + s.i_max + s.p_max + s.z + s.K})
+
+
+def bound(**expressions):
+    d = Diagram("d")
+    known = {
+        "H": d.parameter("H", 2.0, "pu(S)"), "V": d.parameter("V", 1.1, "pu(V)"),
+        "X": d.parameter("X", 0.2, "pu(Z)"), "beta": d.parameter("beta", 1.2, "1"),
+    }  # fmt: skip
+    block = d.add("b", Rated())
+    d.bind(block, **{name: make(**known) for name, make in expressions.items()})
+    return d
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("p_max", lambda H, beta, **_: 1.5 * beta * H),
+        ("p_max", lambda H, beta, **_: ca.fmin(H, 0.5) + 0.1 * H / beta),
+        (
+            "p_max",
+            lambda V, X, **_: V**2 / (2 * X),
+        ),  # a power is voltage times current, whatever it is called
+        ("i_max", lambda H, V, **_: H / V),
+        ("z", lambda X, **_: X),
+        ("v_max", lambda H, X, **_: ca.sqrt(H * X)),
+        ("K", lambda beta, **_: 60 * beta),  # a number may carry the unit
+        ("K", lambda beta, **_: 60 * (1 - 1 / beta)),
+        ("v_max", lambda **_: 0.9),
+    ],
+)
+def test_bindings_of_the_right_unit(name, make):
+    assert len(bound(**{name: make}).compile().parameters) == 8
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "text"),
+    [
+        ("v_max", lambda H, **_: 2 * H, "b.v_max [pu(V)] cannot be bound to 2*H [pu(S)]."),
+        ("i_max", lambda V, beta, **_: beta * V, "b.i_max [pu(I)] cannot be bound to beta*V [pu(V)]."),
+        ("p_max", lambda H, **_: H**2, "b.p_max [pu(S)] cannot be bound to H**2 [pu(S)2]."),
+        ("v_max", lambda H, V, **_: H + V, "b.v_max is bound to H + V, which adds [pu(S)] and [pu(V)]."),
+        ("v_max", lambda V, X, **_: ca.fmax(V, X), "b.v_max is bound to max(V, X), which compares [pu(V)] "
+                                                   "and [pu(Z)]."),
+        ("v_max", lambda V, **_: ca.sqrt(V), "b.v_max is bound to sqrt(V), which takes the root of [pu(V)]."),
+        ("K", lambda V, **_: 60 * ca.exp(V), "b.K is bound to 60*exp(V), which takes a function of [pu(V)]; "
+                                             "divide by its base first."),
+        ("K", lambda V, **_: V**0.3, "b.K is bound to V**0.3, which raises [pu(V)] to a power that is no "
+                                     "whole number."),
+    ],
+)  # fmt: skip
+def test_bindings_of_the_wrong_unit(name, make, text):
+    assert refusal(bound(**{name: make})) == f"d: {text}"
+
+
+# ---- feedthrough ------------------------------------------------------------------------------------------
+
+
+def test_feedthrough_is_read_from_the_equations():
+    assert Gain().feedthrough() == {"y": ("u",)}
+    assert Lag().feedthrough() == {"through": ("u",)}
+    assert Pll().feedthrough() == {"omega": ("v",), "error": ("v",)}
+    d = Diagram("d")
+    u, w = d.input("u", "1"), d.input("w", "1")
+    s, lag = d.add("s", Sum()), d.add("lag", Lag())
+    d.connect(u, s.a)
+    d.connect(w, lag.u)
+    d.connect(lag.x, s.b)
+    d.output("y", s.y)
+    d.output("x", lag.x)
+    d.output("z", lag.through)
+    assert d.feedthrough() == {"y": ("u",), "x": (), "z": ("w",)}
+
+
+# ---- algebraic variables, kept or eliminated --------------------------------------------------------------
+
+
+class Cubic(Block):
+    """0 = c a^3 + a - u."""
+
+    c = Parameter(1.0, "1", (0, 10), "bend", "test")
+    u = Input("1", "in")
+    a = Algebraic(1.0, "1", "root")
+
+    def equations(self, s):
+        return Equations(alg={"a": s.c * s.a**3 + s.a - s.u})
+
+
+class Pair(Block):
+    """Two unknowns in two linear equations, written in the wrong order on purpose."""
+
+    u = Input("1", "in")
+    a = Algebraic(0.0, "1", "first")
+    b = Algebraic(0.0, "1", "second")
+    y = Output("1", "sum")
+
+    def equations(self, s):
+        return Equations(alg={"a": s.a + 2 * s.b - s.u, "b": 3 * s.a - s.b}, out={"y": s.a + s.b})
+
+
+def chain():
+    """A loop through an implicit wire, a linear pair behind it, a lag at the end."""
+    d = feedback(implicit=True, start=0.5)
+    pair, lag = d.add("pair", Pair()), d.add("lag", Lag())
+    d.connect(d.blocks["b"].y, pair.u)
+    d.connect(pair.y, lag.u)
+    d.output("pair", pair.y)
+    d.output("x", lag.x)
+    return d
+
+
+def test_algebraic_variables_are_kept_unless_asked():
+    assert [r.path for r in chain().compile().algebraics] == ["pair.a", "pair.b", "a.b"]
+
+
+@pytest.mark.parametrize(
+    ("eliminate", "left"),
+    [
+        (True, []),
+        (("a.b",), ["pair.a", "pair.b"]),
+        (("pair.a", "pair.b"), ["a.b"]),
+        (["pair.a"], ["pair.b", "a.b"]),
+    ],
+)
+def test_eliminated_variables_are_put_in_terms_of_the_others(eliminate, left):
+    dae = chain().compile(eliminate=eliminate)
+    assert [r.path for r in dae.algebraics] == left
+    u = 0.7
+    b = 2 * u / (1 + 2)  # y = k (u - y)
+    values = {"a.b": b, "pair.a": b / 7, "pair.b": 3 * b / 7}
+    f, g, y = numbers(dae, x=[0.1], z=[values[name] for name in left], u=[u])
+    assert g == pytest.approx([0.0] * len(left), abs=1e-12)
+    assert y == pytest.approx([b, 4 * b / 7, 0.1])
+    assert f == pytest.approx([(4 * b / 7 - 0.1) / 0.5])
+    assert dae.start.numel() == 1 + len(left)
+
+
+def test_equilibrium_and_trajectory_are_the_same_both_ways():
+    from dcvrt import Simulator, Waveform
+    from dcvrt.integrators import Casadi
+    from dcvrt.models import Feeder, Poi, VoltageFilter
+
+    def system(**how):
+        """A current against a feeder, with a mode that hangs on the voltage behind the feeder."""
+
+        class Load(Block):
+            """Constant admittance, cut to a third while the voltage is low."""
+
+            modes = ("FULL", "THIRD")
+            start = "FULL"
+            flags = {"part": (1.0, 1 / 3)}  # noqa: RUF012
+            low = Parameter(0.8, "pu(V)", (0, 1), "cut below")
+            v = Input("pu(V)", "voltage", kind=Phasor)
+            v_f = Input("pu(V)", "measured voltage")
+            i = Output("pu(I)", "current", kind=Phasor)
+
+            def transitions(self, s):
+                return (
+                    Go("FULL", "THIRD", below(s.v.re, s.low) & below(s.v_f, s.low)),
+                    Go("THIRD", "FULL", above(s.v_f, 0.9)),
+                )
+
+            def equations(self, s):
+                return Equations(out={"i": s.v * Phasor(0.8, -0.3) * s.part})
+
+        d = Diagram("feeder")
+        e = d.input("e", "pu(V)", Phasor)
+        feeder, load, meter, poi = (
+            d.add("feeder", Feeder(X=0.3, R=0.05)), d.add("load", Load()), d.add("meter", VoltageFilter()),
+            d.add("poi", Poi()),
+        )  # fmt: skip
+        d.connect(e, feeder.e)
+        d.connect(load.i, feeder.i, poi.i)
+        d.connect(feeder.v, load.v, implicit=True, start=1.0)
+        d.connect(feeder.v, meter.v, poi.v)
+        d.connect(meter.v_f, load.v_f)
+        for name, port in (("v_f", meter.v_f), ("p", poi.p)):
+            d.output(name, port)
+        return d.compile(**how)
+
+    kept, gone = system(), system(eliminate=True)
+    assert [r.path for r in kept.algebraics] == ["load.v.re", "load.v.im"]
+    assert not gone.algebraics
+    tight = {"rtol": 1e-9, "atol": 1e-11}
+    sag = Waveform.sag(0.6, 0.05, 0.1, until=0.4)
+    one = Simulator(kept, Casadi("rosenbrock", **tight), wrt=("feeder.X",))(sag)
+    two = Simulator(gone, Casadi("erk", **tight), wrt=("feeder.X",))(sag)
+    assert [e.target for e in one.events] == ["THIRD", "FULL"]
+    assert [e.time for e in one.events] == pytest.approx([e.time for e in two.events], abs=1e-8)
+    t = np.linspace(0.0, 0.4, 333)
+    for name in ("v_f", "p"):
+        np.testing.assert_allclose(one.at(name, t), two.at(name, t), atol=1e-6)
+    assert one.sens["p", "feeder.X"][-1] == pytest.approx(two.sens["p", "feeder.X"][-1], rel=1e-5)
+    rest = [Simulator(dae).equilibrium(0.95)["p"] for dae in (kept, gone)]
+    assert rest[0] == pytest.approx(rest[1], abs=1e-12)
+
+
+def test_a_variable_without_an_explicit_solution_is_named():
+    d = chain()
+    cubic = d.add("cubic", Cubic())
+    d.connect(d.port("u"), cubic.u)
+    d.output("a", cubic.a)
+    with pytest.raises(ModelError) as error:
+        d.compile(eliminate=True)
+    assert str(error.value) == (
+        "ring: cubic.a cannot be eliminated: its equation is not linear in it. Way out: keep it as algebraic "
+        "(eliminate=('pair.a', 'pair.b', 'a.b')), or write the block with an explicit solution."
+    )
+    assert [r.path for r in d.compile(eliminate=("pair.a", "pair.b", "a.b")).algebraics] == ["cubic.a"]
+    with pytest.raises(ModelError) as error:
+        d.compile(eliminate=["cubic.a"])
+    assert str(error.value) == (
+        "ring: cubic.a cannot be eliminated: its equation is not linear in it. Way out: keep it as algebraic "
+        "(leave `eliminate` out), or write the block with an explicit solution."
+    )
+
+
+def test_what_to_eliminate_is_given_by_paths():
+    for given, text in (
+        ("a.b", "eliminate = 'a.b' must be a tuple of paths, or True: eliminate=('a.b',)."),
+        (("a.c",), "eliminate: ring has no algebraic variable 'a.c'. Did you mean 'a.b'? "
+                   "Known: pair.a, pair.b, a.b."),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as error:
+            chain().compile(eliminate=given)
+        assert str(error.value) == text
+
+
+def test_numbers_of_a_block_are_checked_by_name():
+    with pytest.raises(InputError) as error:
+        Gain().at(u=1.0, uu=2.0)
+    assert str(error.value) == "Gain: there is no 'uu'. Did you mean 'u'? Known: k, u, y."

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dcvrt.errors import ModelError
+from dcvrt import facility
+from dcvrt.errors import InputError, ModelError
 from dcvrt.models import Phasor, smooth
 from dcvrt.units import dimension, same_unit
 
@@ -30,7 +31,7 @@ def test_units_are_products_of_bases():
         ("pu", "unit 'pu': plain 'pu' does not say of what. Write pu(V), pu(I), pu(S) or pu(Z)."),
         ("", "a unit is missing. Write '1' for a ratio."),
         ("pu(W)/s", "unit 'pu(W)/s': 'pu(W)' is not known. Did you mean 'pu(Z)'? Known: 1, s, h, rad, deg, "
-                    "Hz, pu(V), pu(I), pu(S), pu(Z), MW, Mvar, ... (13 in all)."),
+                    "Hz, K, pu(V), pu(I), pu(S), pu(Z), MW, ... (14 in all)."),
     ],
 )  # fmt: skip
 def test_unknown_units_are_refused(unit, text):
@@ -107,3 +108,15 @@ def test_smooth_functions_have_their_derivative_at_the_corner(function, corner):
     slope = float(ca.Function("slope", [a], [ca.jacobian(function(a, eps), a)])(corner))
     h = 1e-7
     assert slope == pytest.approx((function(corner + h, eps) - function(corner - h, eps)) / (2 * h), rel=1e-5)
+
+
+def test_the_automaton_behind_an_output_is_that_whose_flags_it_shows():
+    dae = facility.get("gfl-vfd-cooling").compile()
+    assert dae.automaton_behind("mode").path == "sup"
+    assert dae.automaton_behind("mode_cooling").path == "cooling"
+    with pytest.raises(InputError) as unknown:
+        dae.automaton_behind("mde")
+    assert str(unknown.value).startswith("gfl-vfd-cooling has no output 'mde'. Did you mean 'mode'?")
+    with pytest.raises(InputError) as none:
+        dae.automaton_behind("w_dc")
+    assert str(none.value) == ("gfl-vfd-cooling: output 'w_dc' must show one automaton; it shows none.")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dcvrt import facility
 from dcvrt.errors import InputError
 from dcvrt.studies import checks, config
 from dcvrt.studies.tables import read_profiles
@@ -180,11 +181,11 @@ modes = ["gfm"]
         "  what_if: the label 'nothing' is used more than once.\n"
         "  what_if[1]: varies nothing. Way out: give parameters, or one of the fields of [criteria].\n"
         "  what_if[2].loss_window_ms = 2000: is longer than the simulation of 2 s.\n"
-        "  what_if[3].modes: no variant 'gfx'. Did you mean 'gfm'? Known: gfl, gfm.\n"
-        "  what_if[4].parameters: gfl: sup (Supervisor): 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or "
-        "w < w_sag' and 'MIXED -> NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave "
-        "no gap between them (V_dip = 0.9, V_swell = 1.1, w_sag = 0.85, V_back = 0.88, V_calm = 1.09, w_back "
-        "= 0.95): the modes would chatter. Set the limit of the way back beyond that of the way out.\n"
+        f"  what_if[3].modes: no variant 'gfx'. Did you mean 'gfm'? Known: {', '.join(facility.names())}.\n"
+        "  what_if[4].parameters: gfl: sup: 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' "
+        "and 'MIXED -> NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap "
+        "between them (V_dip = 0.9, V_back = 0.88): the modes would chatter. Set the limit of the way back "
+        "beyond that of the way out.\n"
         '  what_if[5].parameters."vsm.D" = 600 1: is outside [0, 500].\n'
         '  what_if[5].parameters."beta": is set by the study in every run and cannot be fixed here.'
     )
@@ -248,7 +249,7 @@ def test_fields_that_contradict_each_other() -> None:
         "  facility.beta = [1.3, 1.05, 1.1, 1.125, 1.15, 1.175, 1.2, 1.25, 1.3, 1.35, 1.4, 1.5]: must rise "
         "from one value to the next.",
         "  period[3].hour = 9000: is not among the 8760 operating hours (0 to 8759).",
-        "  facility.modes: no variant 'gfn'. Did you mean 'gfm'? Known: gfl, gfm.",
+        f"  facility.modes: no variant 'gfn'. Did you mean 'gfm'? Known: {', '.join(facility.names())}.",
     ]
 
 
@@ -340,10 +341,9 @@ def test_a_fault_needs_a_time_before_it() -> None:
 
 def test_parameters_that_do_not_go_together() -> None:
     told = (
-        "sup (Supervisor): 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' and 'MIXED -> "
-        "NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap between them (V_dip "
-        "= 0.9, V_swell = 1.1, w_sag = 0.85, V_back = 0.88, V_calm = 1.08, w_back = 0.95): the modes would "
-        "chatter. Set the limit of the way back beyond that of the way out."
+        "sup: 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' and 'MIXED -> NORMAL: v_f > "
+        "V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap between them (V_dip = 0.9, V_back "
+        "= 0.88): the modes would chatter. Set the limit of the way back beyond that of the way out."
     )
     assert complaint(changed(('# "sup.T_dip" = 0.25', '"sup.V_back" = 0.88'))) == (
         f"my.toml: 2 problems\n  facility.parameters: gfl: {told}\n  facility.parameters: gfm: {told}"

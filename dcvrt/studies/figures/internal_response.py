@@ -54,7 +54,7 @@ def draw(findings: Findings, mode: str, run: Trajectory) -> Figure:
         title += f"\n{run.status}"
     return ride.draw(
         ride.signals_of(run, Waveform.ercot_style().at(run.t)),
-        findings.facility(mode).automata[0].modes,
+        findings.facility(mode).automaton_behind("mode").modes,
         title,
         findings.study.criteria.v_it_min_pu,
     )

@@ -79,7 +79,7 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
 
     inside, powers = panels
     t = signals["t_s"]
-    modes = findings.facility(case.mode).automata[0].modes
+    modes = findings.facility(case.mode).automaton_behind("mode").modes
     inside.plot(t, signals["v_it_pu"], color=PALETTE[0], label="protected IT voltage")
     inside.plot(t, signals["w_dc_1"], color=PALETTE[4], linestyle=(0, (4, 1.5)), label="DC energy / nominal")
     inside.axhline(

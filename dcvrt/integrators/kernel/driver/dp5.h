@@ -1,0 +1,153 @@
+/* The explicit pair of orders 5 and 4 of Dormand and Prince, with its dense output of order 4.
+ *
+ * J. R. Dormand, P. J. Prince, J. Comp. Appl. Math. 6 (1980) 19-26; dense output: E. Hairer, S. P. Norsett,
+ * G. Wanner, Solving Ordinary Differential Equations I, section II.6. The last stage is the first of the next
+ * step. A method gives the loop: method_restart, method_step, method_accept and method_dense.
+ */
+#ifndef DCVRT_METHOD_H
+#define DCVRT_METHOD_H
+
+enum { STAGES = 7 };
+/* Exponents of the step control: error^-a times (error before)^b, for an error of order h^5; error^-c after
+ * a step that is not taken. */
+#define CONTROL_NOW 0.14
+#define CONTROL_BEFORE 0.08
+#define CONTROL_REJECTED 0.2
+
+static const double NODE[STAGES] = {0.0, 1. / 5, 3. / 10, 4. / 5, 8. / 9, 1.0, 1.0};
+static const double A[STAGES][STAGES - 1] = {
+    {0},
+    {1. / 5},
+    {3. / 40, 9. / 40},
+    {44. / 45, -56. / 15, 32. / 9},
+    {19372. / 6561, -25360. / 2187, 64448. / 6561, -212. / 729},
+    {9017. / 3168, -355. / 33, 46732. / 5247, 49. / 176, -5103. / 18656},
+    {35. / 384, 0.0, 500. / 1113, 125. / 192, -2187. / 6784, 11. / 84},
+};
+static const double ERROR[STAGES] = {71. / 57600,      0.0,       -71. / 16695, 71. / 1920,
+                                     -17253. / 339200, 22. / 525, -1. / 40};
+static const double LAST_TERM[STAGES] = {
+    -12715105075. / 11282082432., 0.0,
+    87487479700. / 32700410799.,  -10690763975. / 1880347072.,
+    701980252875. / 199316789632., -1453857185. / 822651844.,
+    69997945. / 29380423.};
+
+struct method {
+    real k[STAGES][NX];
+    column ks[STAGES][AT_LEAST_ONE(GROUPS * NX)];
+};
+
+/* State for stage s; s is a constant where this is called, so that the sum is unrolled. */
+static inline __attribute__((always_inline)) void stage_state(struct fleet *f, int s, real *x, column *xs)
+{
+    const struct method *w = f->method;
+    for (int i = 0; i < NX; i++) {
+        real sum = A[s][0] * w->k[0][i];
+        for (int j = 1; j < s; j++)
+            if (A[s][j] != 0.0) sum += A[s][j] * w->k[j][i];
+        x[i] = f->x[i] + f->h * sum;
+    }
+    for (int i = 0; i < GROUPS * NX; i++) {
+        column sum = A[s][0] * w->ks[0][i];
+        for (int j = 1; j < s; j++)
+            if (A[s][j] != 0.0) sum += A[s][j] * w->ks[j][i];
+        xs[i] = f->xs[i] + f->h * sum;
+    }
+}
+
+static inline __attribute__((always_inline)) void stage(struct fleet *f, int s)
+{
+    int last = s == STAGES - 1;
+    stage_state(f, s, last ? f->x1 : f->stage_x, last ? f->xs1 : f->stage_xs);
+    fleet_inputs(f, NODE[s], 0);
+    fleet_flow(f, last, f->method->k[s], f->method->ks[s]);
+}
+
+/* One step of every lane from f->x over f->h to f->x1; the error of each over its tolerance. */
+static real method_step(struct fleet *f)
+{
+    struct method *w = f->method;
+    stage(f, 1);
+    stage(f, 2);
+    stage(f, 3);
+    stage(f, 4);
+    stage(f, 5);
+    stage(f, 6);
+    real error[NX];
+    column errors[AT_LEAST_ONE(GROUPS * NX)];
+    for (int i = 0; i < NX; i++) {
+        real sum = ERROR[0] * w->k[0][i];
+        for (int j = 2; j < STAGES; j++) sum += ERROR[j] * w->k[j][i];
+        error[i] = f->h * sum;
+    }
+    for (int i = 0; i < GROUPS * NX; i++) {
+        column sum = ERROR[0] * w->ks[0][i];
+        for (int j = 2; j < STAGES; j++) sum += ERROR[j] * w->ks[j][i];
+        errors[i] = f->h * sum;
+    }
+    return fleet_norm(f, NX, f->x, f->x1, error, f->xs, f->xs1, errors);
+}
+
+/* Rate at the begin of a step after a jump, given as flat vector. */
+static void method_restart(struct fleet *f, int lane, const double *rate)
+{
+    to_lane(rate, NX, f->method->k[0], f->method->ks[0], lane);
+}
+
+/* The lanes that are `taken` go on from the end of the step. */
+static void method_accept(struct fleet *f, lanes_mask taken)
+{
+    struct method *w = f->method;
+    for (int i = 0; i < NX; i++) w->k[0][i] = taken_real(taken, w->k[STAGES - 1][i], w->k[0][i]);
+    for (int i = 0; i < GROUPS * NX; i++)
+        w->ks[0][i] = taken_column(taken, w->ks[STAGES - 1][i], w->ks[0][i]);
+}
+
+/* Rate of the states at the end of the step. */
+static const real *method_rate(struct fleet *f) { return f->method->k[STAGES - 1]; }
+
+static inline void dense_element(double *c0, int stride, double h, double x0, double x1, const double *k)
+{
+    double change = x1 - x0, bend = h * k[0] - change, sum = 0.0;
+    for (int j = 0; j < STAGES; j++) sum += LAST_TERM[j] * k[j];
+    c0[0] = x0;
+    c0[stride] = change;
+    c0[2 * stride] = bend;
+    c0[3 * stride] = change - h * k[STAGES - 1] - bend;
+    c0[4 * stride] = h * sum;
+}
+
+/* Dense output of a lane's last step. */
+static void method_dense(struct fleet *f, int lane, struct dense *d)
+{
+    struct method *w = f->method;
+    double h = AT(f->h, lane), k[STAGES];
+    d->t = AT(f->t, lane);
+    d->h = h;
+    for (int i = 0; i < NX; i++) {
+        for (int j = 0; j < STAGES; j++) k[j] = AT(w->k[j][i], lane);
+        dense_element(&d->c[0][i], ALL, h, AT(f->x[i], lane), AT(f->x1[i], lane), k);
+    }
+    for (int n = 0; n < NW; n++)
+        for (int i = 0; i < NX; i++) {
+            for (int j = 0; j < STAGES; j++) k[j] = *theta_at(w->ks[j], NX, n, i, lane);
+            dense_element(&d->c[0][NX + n * NX + i], ALL, h, *theta_at(f->xs, NX, n, i, lane),
+                          *theta_at(f->xs1, NX, n, i, lane), k);
+        }
+}
+
+/* States in the middle of the step. */
+static void method_middle(struct fleet *f, real *x, real *z)
+{
+    (void)z;
+    const struct method *w = f->method;
+    for (int i = 0; i < NX; i++) {
+        real change = f->x1[i] - f->x[i], bend = f->h * w->k[0][i] - change;
+        real sum = LAST_TERM[0] * w->k[0][i];
+        for (int j = 2; j < STAGES; j++) sum += LAST_TERM[j] * w->k[j][i];
+        real back = change - f->h * w->k[STAGES - 1][i] - bend;
+        x[i] = f->x[i] + 0.5 * (change + 0.5 * (bend + 0.5 * (back + 0.5 * f->h * sum)));
+    }
+}
+
+#endif
