@@ -20,6 +20,9 @@ PLUGINS = ("erk", "rosenbrock", "cvodes", "idas")
 class Casadi:
     """Which CasADi integrator solves the stretches between events, and how tightly.
 
+    Guards are looked at on the samples of a run: a band that a signal crosses in less than `save_at` can be
+    missed. The compiled kernel looks at every step; here a smaller `save_at` is the way out.
+
     Parameters
     ----------
     plugin : ``erk`` (explicit 5(4) pair, for systems without algebraic variables), ``rosenbrock`` (L-stable,

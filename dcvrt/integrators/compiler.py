@@ -112,9 +112,18 @@ def compiled(
     return loaded, f"compiled by {compiler}"
 
 
-@lru_cache(maxsize=8)
 def native_flags(compiler: Compiler) -> tuple[str, ...]:
-    """Flags that let the compiler use all instructions of this processor, if it knows how."""
+    """Flags that let the compiler use all instructions of this processor, if it knows how.
+
+    ``DCVRT_MARCH=x86-64-v3`` (or any other value that the compiler's ``-march`` takes) chooses the
+    instructions instead: ``x86-64-v3`` has four lanes with AVX2, ``x86-64`` two with SSE2.
+    """
+    wanted = os.environ.get("DCVRT_MARCH", "")
+    return (f"-march={wanted}",) if wanted else _flags_of_this_processor(compiler)
+
+
+@lru_cache(maxsize=8)
+def _flags_of_this_processor(compiler: Compiler) -> tuple[str, ...]:
     for flag in ("-march=native", "-mcpu=native"):
         command = [*compiler.command, flag, "-E", "-x", "c", os.devnull]
         if subprocess.run(command, capture_output=True, check=False).returncode == 0:

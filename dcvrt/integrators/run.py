@@ -102,6 +102,7 @@ class Run:
                 self._settle(np.zeros(self.equations.nw), first=number == 0)
                 while self.t < border:
                     self._advance(border)
+                self._fire_due()
         except Ended as over:
             return str(over)
         return COMPLETED
@@ -318,6 +319,13 @@ class Run:
         fires = self.armed + self.held
         row = int(np.nanargmin(fires))
         return float(fires[row]), row
+
+    def _fire_due(self) -> None:
+        """Fire what has run out at this instant, before the inputs jump and its guard may lapse."""
+        fires, row = self._next_timer()
+        while fires <= self.t + SAME_INSTANT:
+            self._fire(row)
+            fires, row = self._next_timer()
 
     def _fire(self, row: int) -> None:
         """A timer has run out."""

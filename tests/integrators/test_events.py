@@ -90,6 +90,23 @@ def test_held_restarts_when_the_guard_lapses() -> None:
     assert [e.time for e in Simulator(finish(s))(dips).events] == [pytest.approx(0.3, abs=1e-12)]
 
 
+@pytest.mark.parametrize("begin", [0.1, 0.2, 0.3, 0.7])
+@pytest.mark.parametrize("off", [0.0, -2e-16, 2e-16, -5e-10, 5e-10])
+def test_a_timer_that_runs_out_as_the_input_jumps_back_fires(
+    begin: float, off: float, tight: Casadi | Kernel
+) -> None:
+    """At one instant the timer is first, however round-off orders the sums of the times."""
+    s, _ = timer(held=None)
+    wave = Waveform.sag(0.5, begin, 0.1, until=begin + 0.3)
+    run = Simulator(finish(s), tight, wrt=("T",))(wave, T=0.1 + off)
+    (event,) = run.events
+    assert event.time == pytest.approx(begin + 0.1, abs=1e-9)
+    assert event.grad["T"] == pytest.approx(1.0, abs=1e-12)
+    assert run.sens["x_out", "T"][-1] == pytest.approx(-1.0, abs=1e-9)
+    late = Simulator(finish(s), tight)(wave, T=0.1 + 3e-9)
+    assert late.events == ()
+
+
 def test_held_counts_from_mode_entry_when_the_guard_was_true_before() -> None:
     s = Sketch({"x": 0.0}, {"T": 0.1})
     _, _, rows = s.automaton("sup", {"a": (0.0,), "b": (0.0,), "c": (0.0,)}, "a")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import platform
+import re
 from functools import cache
 from math import cos, exp, sin
 
@@ -367,6 +369,65 @@ def test_a_rate_that_is_no_number() -> None:
     status = Simulator(dae, Kernel(), start="given").attempt(flat(9.0)).status
     assert status.startswith("integration failed between ")
     assert "no automaton" in status
+
+
+@pytest.mark.parametrize("method", ["dp5", "rosenbrock"])
+def test_a_failure_tells_the_state_at_which_it_ended(method: str) -> None:
+    """x' = ln x - 1 falls to 0 at t = integral of 1 / (1 - ln x) over (0, 1) = e E1(1) = 0.596347 s."""
+    s = Sketch({"x": 1.0}, {"k": 1.0})
+    dae = s.dae({"x": ca.log(s.x["x"]) - 1.0}, {"x_out": s.x["x"]})
+    sim = Simulator(dae, Kernel(method), start="given")  # type: ignore[arg-type]
+    status = sim.attempt(flat(9.0)).status
+    told = re.fullmatch(
+        r"integration failed between 0\.59634\d* and 0\.59634\d* s in mode no automaton: the (state is no "
+        r"longer a finite number|step size became too small); fastest state x = (\S+), rate (\S+) 1/s; "
+        r"last event: none",
+        status,
+    )
+    assert told is not None, status
+    assert 0 < float(told[2]) < 1e-6
+    assert float(told[3]) == pytest.approx(np.log(float(told[2])) - 1.0, rel=1e-3)
+    (in_lanes,) = sim.batch([flat(9.0)], {}).status
+    assert in_lanes.split(" = ")[0] == status.split(" = ")[0]
+    assert float(in_lanes.split("x = ")[1].split(",")[0]) < 1e-6
+
+
+def test_more_events_than_a_run_may_have() -> None:
+    s = Sketch({"x": 0.0}, {"w": 1e-4})
+    q, _, rows = s.automaton("relay", {"up": (1.0,), "down": (-1.0,)}, "up")
+    rows += [go("up", "down", s.x["x"] - s.p["w"]), go("down", "up", -s.x["x"] - s.p["w"])]
+    run = Simulator(s.dae({"x": q[0]}, {"x_out": s.x["x"]}), Kernel(), start="given", save_at=0.1)
+    # the first after w, each of the 10000 further ones after 2 w
+    assert run.attempt(flat(3.0)).status == "more than 10000 events up to 2.0001 s: the automaton chatters"
+
+
+@pytest.mark.parametrize(("march", "lanes"), [("x86-64-v3", 4), ("x86-64", 2)])
+def test_other_instructions_give_the_same_runs(
+    march: str, lanes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fewer lanes, the same answers, and bit for bit on any number of threads."""
+    if platform.machine() != "x86_64":
+        pytest.skip("flags of another processor")
+    waves, table = cases(11)
+    native = simulator("gfl", 1e-9).batch(waves, table, Criteria())
+    monkeypatch.setenv("DCVRT_MARCH", march)
+    ours = [
+        Simulator(system("gfl"), Kernel("dp5", 1e-9, 1e-11, threads=k)).batch(waves, table, Criteria())
+        for k in (1, 2)
+    ]
+    assert row_numbers(ours[0]) == row_numbers(ours[1])
+    assert Simulator(system("gfl"), Kernel("dp5", 1e-9, 1e-11)).backend.endswith(f" {lanes} lanes")
+    for a, b in zip(ours[0].margins, native.margins, strict=True):
+        assert (a is None) == (b is None)
+        if a is not None and b is not None:
+            assert a.sequence == b.sequence
+            assert (a.voltage.value, a.loss.value) == pytest.approx((b.voltage.value, b.loss.value), abs=1e-7)
+
+
+def test_instructions_that_the_compiler_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DCVRT_MARCH", "no-such-processor")
+    with pytest.raises(InputError, match=r"The C compiler failed [^\n]*\n(?s:.*)no-such-processor"):
+        Simulator(ball(), Kernel(), start="given")(flat())
 
 
 def test_too_many_steps_are_told_with_the_limit() -> None:

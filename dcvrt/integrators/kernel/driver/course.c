@@ -414,11 +414,23 @@ static int enter_section(struct course *c, long number)
     return settle(c, none, -1, 0, -1, number == 0);
 }
 
-/* Make the jumps that are due now and set where the next step has to end; 0 when the course is over. */
+/* When the first timer runs out, and its row. */
+static double next_timer(const struct course *c, int *row)
+{
+    double fires = INFINITY;
+    for (int k = 0; k < ROWS; k++)
+        if (c->armed[k] + c->held[k] < fires) fires = c->armed[k] + c->held[k], *row = k;
+    return fires;
+}
+
+/* Make the jumps that are due now and set where the next step has to end; 0 when the course is over. A timer
+ * that runs out at the instant of an input jump fires before it, since its guard held until then. */
 static int next_limit(struct course *c)
 {
     while (c->status == UNDER_WAY) {
-        if (c->t >= c->border) {
+        int row = -1, at_border = c->t >= c->border;
+        double fires = next_timer(c, &row);
+        if (at_border && !(fires <= c->t + SAME_INSTANT)) {
             if (c->section + 1 >= c->task->inputs->sections) {
                 c->status = COMPLETED;
                 break;
@@ -426,18 +438,15 @@ static int next_limit(struct course *c)
             enter_section(c, c->section + 1);
             continue;
         }
-        double fires = INFINITY;
-        int row = -1;
-        for (int k = 0; k < ROWS; k++)
-            if (c->armed[k] + c->held[k] < fires) fires = c->armed[k] + c->held[k], row = k;
-        c->limit = fires < c->border ? fires : c->border;
-        if (c->limit - c->t > LOCATED) return 1;
-        be_at(c, c->limit);
-        if (fires <= c->limit) {
-            double dte[AT_LEAST_ONE(NW)];
-            for (int j = 0; j < NW; j++) dte[j] = c->darmed[row * NW + j] + c->dheld[row * NW + j];
-            settle(c, dte, -1, 0, row, 0);
+        if (!at_border) {
+            c->limit = fires < c->border ? fires : c->border;
+            if (c->limit - c->t > LOCATED) return 1;
+            be_at(c, c->limit);
+            if (fires > c->limit) continue;
         }
+        double dte[AT_LEAST_ONE(NW)];
+        for (int j = 0; j < NW; j++) dte[j] = c->darmed[row * NW + j] + c->dheld[row * NW + j];
+        settle(c, dte, -1, 0, row, 0);
     }
     return 0;
 }

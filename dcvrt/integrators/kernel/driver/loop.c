@@ -472,6 +472,10 @@ static void sail(struct fleet *f, struct work *w)
         for (int l = 0; l < LANES; l++) {
             if (!f->live[l]) continue;
             int taken = judge_step(f, l, AT(error, l)), goes_on = 0;
+            if (!taken && f->course[l]->status != UNDER_WAY) { /* the sentence tells the state at which it ended */
+                from_lane(f->course[l]->x, NX, f->x, f->xs, l);
+                from_lane(f->course[l]->z, NZ, f->z, f->zs, l);
+            }
             if (taken) {
                 goes_on = after_step(f, l, lane_of(crossing, l), lane_of(missed, l));
                 if (goes_on) set_lane(&smooth, l);
