@@ -46,10 +46,16 @@ __all__ = [
 RESERVED = {"values", "sources", "clock", "mode"}
 """Names that mean something to every block, beside those of the class."""
 
+SHORTEST = 1e-6
+"""Time constants that are not 0 may be set down to here, s, once they are compiled."""
+
 
 @dataclass(frozen=True)
 class Equations:
-    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable."""
+    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable.
+
+    For a state that names its time constant T, `der` holds the right side of T dx/dt = ...
+    """
 
     der: Mapping[str, Scalar] = field(default_factory=dict)
     out: Mapping[str, Scalar | Phasor] = field(default_factory=dict)
@@ -101,6 +107,13 @@ class Block(Part):
                 problems.append(f"{name}: {error}")
             if hasattr(Block, name) or name in RESERVED - ({"mode"} if isinstance(d, Output) else set()):
                 problems.append(f"{name!r} is a name that every block has; choose another.")
+            if isinstance(d, State) and d.time:
+                lag = cls._declared.get(d.time)
+                if not isinstance(lag, Parameter) or lag.unit != "s" or lag.bounds[0] < 0:
+                    problems.append(
+                        f"{name}: its time constant {d.time!r} must be a parameter of the block in s, "
+                        "with bounds from 0 on."
+                    )
         for flag, column in cls.flags.items():
             if flag in cls._declared:
                 problems.append(f"the flag {flag!r} has the name of a symbol of the block.")
@@ -152,6 +165,43 @@ class Block(Part):
         Where these lead in a ring from a state back to itself, the declared `start` is taken instead.
         """
         return {}
+
+    # ---- time constants that are 0 --------------------------------------------------------------------
+
+    def lagless(self) -> tuple[str, ...]:
+        """States that are none on this block, because their time constant is 0.
+
+        >>> from dcvrt.models import CurrentLag
+        >>> CurrentLag().lagless()
+        ()
+        """
+        states = self.declared(State).items()
+        return tuple(name for name, state in states if state.time and self.values[state.time] == 0)
+
+    def settable(self, parameter: str) -> tuple[float, float]:
+        """Range that a parameter keeps once the block is compiled.
+
+        A time constant that is 0 stays 0, and one that is not stays above 0: otherwise the system would be
+        another one.
+        """
+        low, high = self.declared(Parameter)[parameter].bounds
+        value = self.values[parameter]
+        if not any(state.time == parameter for state in self.declared(State).values()):
+            return low, high
+        return (max(low, min(value, SHORTEST)), high) if value else (0.0, 0.0)
+
+    def reduced(self, eq: Equations, s: Any) -> Equations:
+        """The equations with time constants divided out, and those that are 0 among the residuals."""
+        gone, states = self.lagless(), self.declared(State)
+        return Equations(
+            der={
+                name: side / getattr(s, states[name].time) if states[name].time else side
+                for name, side in eq.der.items()
+                if name not in gone
+            },
+            out=eq.out,
+            alg={**eq.alg, **{name: eq.der[name] for name in gone}},
+        )
 
     # ---- use ------------------------------------------------------------------------------------------
 

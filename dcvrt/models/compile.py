@@ -24,6 +24,7 @@ from dcvrt.models.block import (
 )
 from dcvrt.models.declared import Declared
 from dcvrt.models.diagram import Diagram
+from dcvrt.models.expressions import text_of
 from dcvrt.models.netlist import Netlist, netlist
 from dcvrt.models.phasor import Phasor
 from dcvrt.models.structure import structure_problems
@@ -68,8 +69,11 @@ class Flattener:
         self.eq: dict[str, Equations] = {}
         problems = []
         for path, block in net.blocks.items():
-            self.eq[path] = block.equations(self.s[path])
-            problems += check_equations(path, block, self.eq[path])
+            given = block.equations(self.s[path])
+            wrong = check_equations(path, block, given)
+            problems += wrong
+            self.eq[path] = given if wrong else block.reduced(given, self.s[path])
+        problems += self.time_problems()
         raise_all(problems, net.name, ModelError)
         self.u = {name: signal(name, declared.kind) for name, (declared, _) in net.inputs.items()}
         self.implicit = {
@@ -85,6 +89,25 @@ class Flattener:
         found = self.net.find(end)
         assert found is not None
         return found
+
+    def time_problems(self) -> list[str]:
+        """Time constants that are bound to something whose being 0 or not is another than the block's own."""
+        shared = self.net.shared.values()
+        symbols, values = [v.symbol for v in shared], [v.declared.value for v in shared]
+        problems = []
+        for path, block in self.net.blocks.items():
+            for name in {state.time for state in block.declared(State).values()} - {""}:
+                bound = self.net.bindings.get((path, name))
+                if bound is None:
+                    continue
+                number = float(ca.Function("v", symbols, [ca.SX(bound)])(*values))
+                if (number == 0) != (block.values[name] == 0):
+                    problems.append(
+                        f"{path}.{name} is bound to {text_of(bound)} = {number:g} s, but the block was made "
+                        f"with {block.values[name]:g} s. What is a state must be known when the block is "
+                        f"made: give it {name} = {number:g} as well."
+                    )
+        return problems
 
     # ---- values ---------------------------------------------------------------------------------------
 
@@ -155,14 +178,18 @@ class Flattener:
     def states(self) -> Iterator[tuple[str, State]]:
         """Every state with the name of its block, in the order of `x`."""
         for name, block in self.net.blocks.items():
+            gone = block.lagless()
             for state in block.declared(State).values():
-                yield name, state
+                if state.name not in gone:
+                    yield name, state
 
     def unknowns(self) -> list[Unknown]:
-        """Algebraic variables: those that blocks declare and those of implicit wires."""
+        """Algebraic variables: of blocks, states whose time constant is 0, those of implicit wires."""
         found = []
         for name, block in self.net.blocks.items():
-            for key, d in block.declared(Algebraic).items():
+            states = block.declared(State)
+            lagless = {key: states[key] for key in block.lagless()}
+            for key, d in (block.declared(Algebraic) | lagless).items():
                 residual = stack([self.resolve(name, self.eq[name].alg[key])])
                 found.append(
                     Unknown(
@@ -190,7 +217,7 @@ class Flattener:
             for key, d in block.declared(Parameter).items():
                 if (name, key) not in self.net.bindings:
                     value, source = block.values[key], block.sources[key]
-                    rows.append(Row(f"{name}.{key}", d.unit, value, d.bounds, d.doc, source))
+                    rows.append(Row(f"{name}.{key}", d.unit, value, block.settable(key), d.doc, source))
                     symbols.append(getattr(self.s[name], key))
         return rows, stack(symbols)
 
