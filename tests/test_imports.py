@@ -39,7 +39,7 @@ ALLOWED = {
     "criteria": BASE | FUNCTIONALS | {"trajectory", "dae", "waveform"},
     "integrators": CRITERIA,
     "fmi": {"errors", "units", "dae", "integrators", "fmi"},  # of the integrators the compiler chain only
-    "grid": GRID,
+    "grid": GRID | MODELS,  # machines are blocks
     "planning": PLANNING,
     "studies": PLANNING | {"studies", "scenarios", "envelopes"},
     "cli": PLANNING | {"fmi", "studies", "cli", "scenarios", "envelopes"},

@@ -1,9 +1,19 @@
 """Networks, power flow and fault simulation: where POI waveforms come from."""
 
-from dcvrt.grid.faults import BusFault
+from dcvrt.grid.faults import BusFault, FaultSequence, LineTrip
 from dcvrt.grid.grid import FaultRun, Grid
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
 from dcvrt.grid.screening import FaultScreen, screen_faults
 
-__all__ = ["BusFault", "FaultRun", "FaultScreen", "Grid", "Network", "Period", "screen_faults"]
+__all__ = [
+    "BusFault",
+    "FaultRun",
+    "FaultScreen",
+    "FaultSequence",
+    "Grid",
+    "LineTrip",
+    "Network",
+    "Period",
+    "screen_faults",
+]

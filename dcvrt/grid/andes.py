@@ -24,10 +24,17 @@ import numpy.typing as npt
 from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid.dynamics118 import Machine
+from dcvrt.grid import units
 from dcvrt.grid.network import Branches, Generators, Network
+from dcvrt.grid.units import Unit
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
+
+NO_MACHINES = (
+    "{where}: the case has no dynamic data, not one machine. Way out: add a machine (GENROU, GENCLS) for each "
+    "generator, in a .dyr file given as dynamics=... or in the case itself."
+)
 
 # -- the generated code ------------------------------------------------------------------------------------
 
@@ -273,6 +280,39 @@ def read_network(path: Path, dynamics: Path | None, name: str) -> Network:
             name=tuple(f"unit {k + 1} at bus {int(x)}" for k, x in enumerate(unit[:, 0])),
         ),
     )
+
+
+def read_units(path: Path, dynamics: Path | None, machines: Sequence[Machine], name: str) -> tuple[Unit, ...]:
+    """Generating units of a case, with their values on the system base; see `read`.
+
+    Parameters
+    ----------
+    machines : sequence of Machine
+        Those that are added to what the file has.
+    name : str
+        What messages call the case.
+
+    Raises
+    ------
+    InputError
+        When the case has no machine, or a dynamic model that the native engine lacks: model, count, devices.
+    """
+    system = read(path, dynamics)
+    add_machines(system, machines)
+    with quiet():
+        system.setup()
+    lacking = units.unsupported(system)
+    if lacking:
+        lines = [f"{model}: {count} device(s): {', '.join(map(str, names))}" for model, count, names in lacking]
+        raise InputError(
+            f"{name}: the native engine lacks {len(lines)} dynamic model(s) of this case.\n  "
+            + "\n  ".join(lines)
+            + "\nWay out: engine='andes', or replace these devices."
+        )
+    found = tuple(units.read_units(system))
+    if not found:
+        raise InputError(NO_MACHINES.format(where=name))
+    return found
 
 
 def add_machines(system: Any, units: Sequence[Machine]) -> None:

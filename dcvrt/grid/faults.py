@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from dcvrt.errors import raise_all
+from dcvrt.errors import InputError, raise_all
+from dcvrt.grid.network import Network
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A network that holds from one change to the next.
+
+    Parameters
+    ----------
+    begin : float
+        s.
+    shunts : mapping of bus number to complex
+        Admittance of faults, pu on the system base.
+    out : frozenset of int
+        Positions of open branches.
+    """
+
+    begin: float
+    shunts: Mapping[int, complex] = field(default_factory=dict)
+    out: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -77,7 +98,165 @@ class BusFault:
         """Time of clearing, s."""
         return self.start + self.clear
 
+    def stages(self, network: Network) -> tuple[Stage, ...]:
+        """The network before, in and after the fault."""
+        shunt = {self.bus: 1.0 / complex(self.r_f, self.x_f)}
+        return Stage(0.0), Stage(self.start, shunt), Stage(self.cleared_at)
+
     @property
     def label(self) -> str:
         """What tables call it."""
         return f"bus {self.bus}, {1e3 * self.clear:g} ms"
+
+
+@dataclass(frozen=True)
+class LineTrip:
+    """A branch that opens without a fault, and closes again where a time is given.
+
+    Parameters
+    ----------
+    from_bus, to_bus : int
+        Its ends; of parallel branches the first that is in service opens.
+    start : float
+        s; after 0.
+    reclose : float, optional
+        Time from opening to closing, s.
+
+    Raises
+    ------
+    InputError
+        With every fault of the values at once.
+
+    Examples
+    --------
+    >>> LineTrip(23, 24, start=1.0, reclose=0.5).label
+    'line 23-24, 500 ms'
+    """
+
+    from_bus: int
+    to_bus: int
+    start: float = 0.1
+    reclose: float | None = None
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not np.isfinite(self.start) or self.start <= 0:
+            problems.append(f"start = {self.start} s must be after 0 s.")
+        if self.reclose is not None and not 0 < self.reclose < np.inf:
+            problems.append(f"reclose = {self.reclose} s is the time from opening to closing: above 0.")
+        raise_all(problems, f"trip of line {self.from_bus}-{self.to_bus}")
+
+    @property
+    def bus(self) -> int:
+        """The end that it is named by."""
+        return self.from_bus
+
+    @property
+    def cleared_at(self) -> float:
+        """Time of the last change, s."""
+        return self.start + (self.reclose or 0.0)
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        name = f"line {self.from_bus}-{self.to_bus}"
+        return name if self.reclose is None else f"{name}, {1e3 * self.reclose:g} ms"
+
+    def stages(self, network: Network) -> tuple[Stage, ...]:
+        """The network before and after.
+
+        Raises
+        ------
+        InputError
+            When no branch in service joins the two buses.
+        """
+        opened = Stage(self.start, {}, frozenset({branch(network, self.from_bus, self.to_bus)}))
+        closed = () if self.reclose is None else (Stage(self.cleared_at),)
+        return Stage(0.0), opened, *closed
+
+
+@dataclass(frozen=True)
+class FaultSequence:
+    """Faults and line trips one after another: unsuccessful reclosing, a series of sags.
+
+    Parameters
+    ----------
+    events : tuple of BusFault or LineTrip
+        In the order of time, none starting before the one before it is cleared. A line that is opened for good
+        stays open.
+
+    Raises
+    ------
+    InputError
+        When two overlap, or there is none.
+
+    Examples
+    --------
+    >>> shots = FaultSequence((BusFault(23, 0.1, 0.07), BusFault(23, 0.6, 0.07)))
+    >>> shots.cleared_at
+    0.67
+    """
+
+    events: tuple[BusFault | LineTrip, ...]
+
+    def __post_init__(self) -> None:
+        if not self.events:
+            raise InputError("a sequence needs at least one fault.")
+        problems = [
+            f"{later.label} starts at {later.start:g} s, before {earlier.label} ends at {earlier.cleared_at:g} s."
+            for earlier, later in zip(self.events, self.events[1:], strict=False)
+            if later.start <= earlier.cleared_at
+        ]
+        raise_all(problems, "sequence of faults")
+
+    @property
+    def bus(self) -> int:
+        """The bus that the first is named by."""
+        return self.events[0].bus
+
+    @property
+    def start(self) -> float:
+        """Time of the first, s."""
+        return self.events[0].start
+
+    @property
+    def cleared_at(self) -> float:
+        """Time of the last change, s."""
+        return self.events[-1].cleared_at
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return " then ".join(event.label for event in self.events)
+
+    def stages(self, network: Network) -> tuple[Stage, ...]:
+        """The network from change to change."""
+        found, out = [Stage(0.0)], frozenset[int]()
+        for event in self.events:
+            _, *own = event.stages(network)
+            found += [Stage(stage.begin, stage.shunts, stage.out | out) for stage in own]
+            out = found[-1].out
+        return tuple(found)
+
+
+Fault = BusFault | LineTrip | FaultSequence
+
+
+def branch(network: Network, from_bus: int, to_bus: int) -> int:
+    """Position of the first branch between two buses, in either direction.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+    """
+    lines = network.branches
+    ends = {from_bus, to_bus}
+    for k in range(len(lines)):
+        if {int(lines.from_bus[k]), int(lines.to_bus[k])} == ends:
+            return k
+    near = [lines.label(k) for k in range(len(lines)) if ends & {int(lines.from_bus[k]), int(lines.to_bus[k])}]
+    raise InputError(
+        f"{network.name}: no branch joins buses {from_bus} and {to_bus}. Those at either end: "
+        f"{', '.join(near) or 'none; check the bus numbers'}."
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,17 +12,21 @@ import numpy.typing as npt
 
 from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
-from dcvrt.grid.faults import BusFault
+from dcvrt.grid.faults import BusFault, Fault, FaultSequence, LineTrip, branch
+from dcvrt.grid.native.engine import Engine, sample_times, thetas
 from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
 from dcvrt.waveform import Waveform
 
 Floats = npt.NDArray[np.float64]
+Phasors = npt.NDArray[np.complex128]
 
+ENGINES = ("native", "andes")
 STEP = 1.0 / 120.0
-"""Default step, s. Complex voltages are 2e-4 pu off in a fault and 4e-4 pu after, against 1/1920 s; twice the
-step takes half the time and has four times the error."""
+"""Default sample distance, s, and the step of ANDES: its complex voltages are 2e-4 pu off in a fault and 4e-4 pu
+after, against 1/1920 s; twice the step takes half the time and has four times the error. The native engine
+chooses its own steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +35,14 @@ class FaultRun(Mapping[int, Waveform]):
 
     Parameters
     ----------
-    fault : BusFault
+    fault : BusFault, LineTrip or FaultSequence
     waveforms : mapping of bus to Waveform
         Empty when the simulation did not reach its end.
     status : str
         How it ended.
     """
 
-    fault: BusFault
+    fault: Fault
     waveforms: Mapping[int, Waveform]
     status: str
 
@@ -84,6 +88,8 @@ class Grid:
     redispatch : str
         Who supplies a change of load. `proportional`: all scheduled units in proportion to their schedule, up
         to their limits, losses included; `slack`: the unit at the slack bus.
+    reactive_limits : bool
+        Whether the native engine's power flow keeps units within their reactive limits; ANDES's does not.
     """
 
     name: str
@@ -93,6 +99,7 @@ class Grid:
     dynamics: Path | None = None
     rule: bool = False
     redispatch: str = "proportional"
+    reactive_limits: bool = False
 
     @classmethod
     def from_case(
@@ -102,6 +109,7 @@ class Grid:
         pf: float = 0.98,
         dynamics: str | Path | None = None,
         redispatch: str = "proportional",
+        reactive_limits: bool = False,
     ) -> Grid:
         """Open a case.
 
@@ -117,6 +125,8 @@ class Grid:
             File with the dynamic data (.dyr); for a .raw file the .dyr file beside it when not given.
         redispatch : str
             `proportional` or `slack`.
+        reactive_limits : bool
+            Whether the native engine's power flow keeps units within their reactive limits.
 
         Raises
         ------
@@ -126,7 +136,7 @@ class Grid:
         if str(case) == "ieee118":
             if dynamics is not None:
                 raise InputError("ieee118 has its own dynamic data; dynamics= is for case files.")
-            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch)
+            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch, reactive_limits)
         else:
             path = Path(case)
             if not path.suffix:
@@ -135,9 +145,8 @@ class Grid:
             beside = path.with_suffix(".dyr")
             if dynamics is None and path.suffix.lower() == ".raw" and beside.is_file():
                 dynamics = beside
-            grid = cls(
-                path.stem, path, tuple(sites), pf, Path(dynamics) if dynamics else None, False, redispatch
-            )
+            given = Path(dynamics) if dynamics else None
+            grid = cls(path.stem, path, tuple(sites), pf, given, False, redispatch, reactive_limits)
         grid._check()
         return grid
 
@@ -147,17 +156,17 @@ class Grid:
         return Network.ieee118() if self.rule else andes.read_network(self.path, self.dynamics, self.name)
 
     def __getstate__(self) -> dict[str, object]:
-        return {key: value for key, value in self.__dict__.items() if key != "network"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("network", "native")}
 
     # -- what is asked for ---------------------------------------------------------------------------------
 
     def waveforms(
         self,
         hosting: Mapping[int, float],
-        fault: BusFault,
+        fault: Fault,
         until: float = 2.5,
         period: Period | None = None,
-        engine: str = "andes",
+        engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
         facilities: Mapping[int, object] | None = None,
@@ -168,15 +177,20 @@ class Grid:
         ----------
         hosting : mapping of site to MW
             Hosted capacity; a site that is left out hosts nothing.
-        fault : BusFault
+        fault : BusFault, LineTrip or FaultSequence
+            ANDES takes bus faults only.
         until : float
             End, s.
         period : Period, optional
             Operating period; default: reference load, no wind, data centres at full load.
         engine : str
-            `andes`.
+            `native`: the compiled engine of dcvrt; `andes`: the equations as ANDES evaluates them.
         step : float
-            Step and sample distance, s.
+            Sample distance, s; ANDES steps by it too.
+        wrt : sequence of str
+            Quantities that the waveforms carry tangents of, with `native`: `H` (every site) or `H_<bus>`, MW;
+            `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
+            cleared, s.
 
         Returns
         -------
@@ -201,13 +215,13 @@ class Grid:
         self,
         hosting: Mapping[int, float],
         period: Period | None,
-        faults: Sequence[BusFault],
+        faults: Sequence[Fault],
         until: float = 2.5,
-        engine: str = "andes",
+        engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
         facilities: Mapping[int, object] | None = None,
-    ) -> dict[BusFault, FaultRun]:
+    ) -> dict[Fault, FaultRun]:
         """Several faults of one operating point, which is solved and initialised once; see `waveforms`.
 
         A fault whose simulation does not reach its end stays in, with its status. An operating point that has
@@ -215,19 +229,80 @@ class Grid:
         """
         period = period or Period()
         self._check_request(hosting, period, faults, until, engine, step, wrt, facilities)
-        point = self.operating_point(hosting, period, faults)
+        once = list(dict.fromkeys(faults))
+        found = self._by_andes if engine == "andes" else self._by_own_engine
         runs = {}
-        for fault in dict.fromkeys(faults):
-            times = _times(fault, until, step)
-            v, status = point.simulate(fault, times, self.sites)
-            t = np.concatenate(times)
+        for fault, (t, v, tangents, status) in found(hosting, period, once, until, step, wrt):
             name = f"{self.name}, {period.name}, fault at {fault.label}"
             reached = () if status else enumerate(self.sites)
             waveforms = {
-                bus: Waveform.from_samples(t, v[:, k], name=f"{name}, bus {bus}") for k, bus in reached
+                bus: Waveform.from_samples(
+                    t, v[:, k], {q: dv[:, k] for q, dv in tangents.items()}, name=f"{name}, bus {bus}"
+                )
+                for k, bus in reached
             }
             runs[fault] = FaultRun(fault, waveforms, f"{name}: {status or 'completed.'}")
         return runs
+
+    def _by_andes(
+        self,
+        hosting: Mapping[int, float],
+        period: Period,
+        faults: Sequence[Fault],
+        until: float,
+        step: float,
+        wrt: Sequence[str],
+    ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
+        bolted = [fault for fault in faults if isinstance(fault, BusFault)]
+        point = self.operating_point(hosting, period, bolted)
+        for fault in bolted:
+            times = sample_times(fault.stages(self.network), until, step)
+            v, status = point.simulate(fault, times, self.sites)
+            yield fault, (np.concatenate(times), v, {}, status)
+
+    def _by_own_engine(
+        self,
+        hosting: Mapping[int, float],
+        period: Period,
+        faults: Sequence[Fault],
+        until: float,
+        step: float,
+        wrt: Sequence[str],
+    ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
+        by = thetas(wrt, self.sites, self.network)
+        point = self.native.point(hosting, period, by)
+        for fault in faults:
+            times = sample_times(fault.stages(self.network), until, step)
+            try:
+                run = self.native.simulate(point, fault, times, by)
+            except SimulationError as error:  # islands: this fault has no result, the others may have
+                yield fault, (np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error))
+                continue
+            tangents = {q.name: run.tangents[:, k] for k, q in enumerate(by)}
+            yield fault, (np.concatenate(times), run.v, tangents, run.status)
+
+    @cached_property
+    def native(self) -> Engine:
+        """The native engine on this grid.
+
+        Raises
+        ------
+        InputError
+            When the case has a dynamic model that the engine lacks, with model, devices and count.
+        """
+        return Engine(
+            self.network,
+            andes.read_units(self.path, self.dynamics, self.machines, self.name),
+            self.sites,
+            1 + 1j * float(np.tan(np.arccos(self.pf))),
+            self.redispatch,
+            self.reactive_limits,
+        )
+
+    @property
+    def machines(self) -> Sequence[dynamics118.Machine]:
+        """Machines that the rule table adds to the case file."""
+        return dynamics118.machines(self.network) if self.rule else ()
 
     def operating_point(
         self, hosting: Mapping[int, float], period: Period | None = None, faults: Sequence[BusFault] = ()
@@ -236,7 +311,7 @@ class Grid:
         period = period or Period()
         system = andes.read(self.path, self.dynamics)
         if self.rule:
-            andes.add_machines(system, dynamics118.machines(self.network))
+            andes.add_machines(system, self.machines)
         q_per_p = float(np.tan(np.arccos(self.pf)))
         hosted = {bus: period.dc_factor * hosting.get(bus, 0.0) * (1 + 1j * q_per_p) for bus in self.sites}
         return OperatingPoint(
@@ -272,7 +347,7 @@ class Grid:
         self,
         hosting: Mapping[int, float],
         period: Period,
-        faults: Sequence[BusFault],
+        faults: Sequence[Fault],
         until: float,
         engine: str,
         step: float,
@@ -280,17 +355,27 @@ class Grid:
         facilities: Mapping[int, object] | None,
     ) -> None:
         problems = []
-        if engine != "andes":
-            problems.append(f"engine = {engine!r} is not available: the only engine so far is 'andes'.")
-        if wrt:
-            problems.append(
-                "wrt: ANDES gives no derivatives; waveforms with tangents need the native engine, which does "
-                "not exist yet. Way out: leave wrt out and take differences of two runs."
-            )
+        if engine not in ENGINES:
+            problems.append(f"engine = {engine!r} is not known.{did_you_mean(engine, ENGINES)}")
+        if engine == "andes":
+            if wrt:
+                problems.append("wrt: ANDES gives no derivatives. Way out: engine='native'.")
+            if self.reactive_limits:
+                problems.append(
+                    "reactive_limits: the power flow of engine='andes' does not keep them. Way out: "
+                    "engine='native', or reactive_limits=False."
+                )
+            problems += [
+                f"fault {fault.label}: engine='andes' takes bus faults only. Way out: engine='native'."
+                for fault in dict.fromkeys(faults)
+                if not isinstance(fault, BusFault)
+            ]
+        else:
+            problems += _problems(thetas, wrt, self.sites, self.network)
         if facilities is not None:
             problems.append(
-                "facilities: coupling them into the network needs the native engine, which does not exist "
-                "yet. Way out: run each facility on the waveform that this call returns without facilities=."
+                "facilities: coupling them into the network is not available. Way out: run each facility on the "
+                "waveform that this call returns without facilities=."
             )
         for bus, mw in hosting.items():
             if bus not in self.sites:
@@ -301,15 +386,20 @@ class Grid:
         if not faults:
             problems.append("faults is empty: at least one fault is needed.")
         for fault in dict.fromkeys(faults):
-            problems += [f"fault: {line}" for line in self._unknown([fault.bus])]
-            if fault.bus in self.sites:
-                problems.append(
-                    f"fault at bus {fault.bus}: it is a candidate site, and no site rides through a fault at "
-                    "its own bus. Way out: a fault at a neighbouring bus."
-                )
+            events = fault.events if isinstance(fault, FaultSequence) else (fault,)
+            for event in events:
+                if isinstance(event, LineTrip):
+                    problems += _problems(branch, self.network, event.from_bus, event.to_bus)
+                    continue
+                problems += [f"fault: {line}" for line in self._unknown([event.bus])]
+                if event.bus in self.sites:
+                    problems.append(
+                        f"fault at bus {event.bus}: it is a candidate site, and no site rides through a fault at "
+                        "its own bus. Way out: a fault at a neighbouring bus."
+                    )
             if until <= fault.cleared_at:
                 problems.append(
-                    f"fault at bus {fault.bus}: until = {until:g} s ends before it is cleared at "
+                    f"fault at {fault.label}: until = {until:g} s ends before it is cleared at "
                     f"{fault.cleared_at:g} s."
                 )
         if not np.isfinite(until):
@@ -319,10 +409,10 @@ class Grid:
         raise_all(problems, self.name)
 
 
-def _times(fault: BusFault, until: float, step: float) -> tuple[Floats, Floats, Floats]:
-    """Even sample times before, in and after the fault; each stretch has its own two ends."""
-
-    def even(a: float, b: float) -> Floats:
-        return np.linspace(a, b, int(np.ceil((b - a) / step - 1e-9)) + 1)
-
-    return even(0.0, fault.start), even(fault.start, fault.cleared_at), even(fault.cleared_at, until)
+def _problems(check: Callable[..., object], *given: object) -> list[str]:
+    """What a check that raises `InputError` says, as a list."""
+    try:
+        check(*given)
+    except InputError as error:
+        return [str(error)]
+    return []

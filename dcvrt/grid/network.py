@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -196,15 +196,22 @@ class Network:
         """
         return self._admittance
 
+    def admittance_without(self, out: Collection[int]) -> sp.csr_matrix:
+        """Y with the branches at these positions open."""
+        return self._admittance_of(np.setdiff1d(np.arange(len(self.branches)), np.array(list(out), dtype=int)))
+
     @cached_property
     def _admittance(self) -> sp.csr_matrix:
+        return self._admittance_of(np.arange(len(self.branches)))
+
+    def _admittance_of(self, closed: Integers) -> sp.csr_matrix:
         lines, n = self.branches, len(self.bus)
-        series = 1.0 / (lines.r + 1j * lines.x)
-        ratio = lines.tap * np.exp(1j * lines.shift)
-        at_to = series + 0.5j * lines.b
+        series = 1.0 / (lines.r + 1j * lines.x)[closed]
+        ratio = (lines.tap * np.exp(1j * lines.shift))[closed]
+        at_to = series + 0.5j * lines.b[closed]
         at_from = at_to / (ratio * ratio.conj())
         shunt = (self.g_shunt + 1j * self.b_shunt) / self.base_mva
-        f, t, every = self.from_index, self.to_index, np.arange(n)
+        f, t, every = self.from_index[closed], self.to_index[closed], np.arange(n)
         rows, columns = np.r_[f, f, t, t, every], np.r_[f, t, f, t, every]
         values = np.r_[at_from, -series / ratio.conj(), -series / ratio, at_to, shunt]
         return sp.csr_matrix((values, (rows, columns)), shape=(n, n))

@@ -1,0 +1,175 @@
+"""A grid as the native engine runs it: units in groups of one structure, operating points, derivatives."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dcvrt.errors import InputError, raise_all
+from dcvrt.grid.faults import Fault, Stage
+from dcvrt.grid.native.fleet import Group, Unit
+from dcvrt.grid.native.point import NativePoint, System, refuse_islands
+from dcvrt.grid.native.run import Options, Simulated
+from dcvrt.grid.native.steady import directions, loads
+from dcvrt.grid.native.text import Structure
+from dcvrt.grid.network import Network
+from dcvrt.grid.period import Period
+from dcvrt.models.machines import setpoints
+
+Floats = npt.NDArray[np.float64]
+Phasors = npt.NDArray[np.complex128]
+
+QUANTITY = re.compile(r"(?:(?P<kind>H|wind)_(?P<bus>\d+)|(?P<whole>load|clear))")
+
+
+class Described(Protocol):
+    """A generating unit as a case describes it."""
+
+    name: str
+    bus: int
+    share_p: float
+    share_q: float
+    structure: Any
+    values: Mapping[str, float]
+
+    def diagram(self) -> Any:
+        """The unit wired from blocks, with its values."""
+
+
+@dataclass(frozen=True)
+class Theta:
+    """A quantity that waveforms are differentiated by.
+
+    Parameters
+    ----------
+    name : str
+        As tangents are called: `H_21`, `wind_69`, `load`, `clear`.
+    kind : str
+    bus : int, optional
+    """
+
+    name: str
+    kind: str
+    bus: int | None
+
+
+def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[Theta, ...]:
+    """Quantities by name: `H` stands for `H_<bus>` of every site.
+
+    Raises
+    ------
+    InputError
+        With every name that is none.
+    """
+    names = [name for w in wrt for name in ([f"H_{b}" for b in sites] if w == "H" else [w])]
+    found, problems = [], []
+    for name in dict.fromkeys(names):
+        match = QUANTITY.fullmatch(name)
+        if match is None:
+            problems.append(
+                f"wrt: {name!r} is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every "
+                "load) and clear (s)."
+            )
+            continue
+        bus = None if match["bus"] is None else int(match["bus"])
+        if match["kind"] == "H" and bus not in sites:
+            problems.append(f"wrt: {name!r}: bus {bus} is not one of the sites {', '.join(map(str, sites))}.")
+        elif bus is not None and bus not in set(network.bus.tolist()):
+            problems.append(f"wrt: {name!r}: no bus {bus}.")
+        found.append(Theta(name, match["kind"] or match["whole"], bus))
+    raise_all(problems, network.name, InputError)
+    return tuple(found)
+
+
+def groups(units: Iterable[Described]) -> tuple[Group, ...]:
+    """Units in groups of one structure, each compiled once."""
+    by_structure: dict[Any, list[Described]] = {}
+    for unit in units:
+        by_structure.setdefault(unit.structure, []).append(unit)
+    made = []
+    for same in by_structure.values():
+        dae = same[0].diagram().compile()
+        follow = setpoints(dae)
+        angle = "machine.delta"
+        structure = Structure(dae, moving=follow, angle=angle if angle in dae.x_names else "")
+        members = [Unit(u.name, u.bus, u.values, u.share_p, u.share_q) for u in same]
+        behind = next(path for path in ("machine.x_q", "machine.x_d1") if path in dae.p_names)
+        made.append(Group(structure, members, follow, "machine.M", behind))
+    return tuple(made)
+
+
+@dataclass(frozen=True, eq=False)
+class Engine:
+    """A grid ready for any operating point.
+
+    Parameters
+    ----------
+    network : Network
+    units : sequence of Described
+    sites : sequence of int
+    per_hosted : complex
+        MVA that a hosted MW takes.
+    rule : str
+        Who supplies a change of load, one of `redispatch.RULES`.
+    reactive_limits : bool
+        Whether units respect their reactive limits in the power flow.
+    """
+
+    network: Network
+    units: tuple[Described, ...]
+    sites: tuple[int, ...]
+    per_hosted: complex
+    rule: str = "proportional"
+    reactive_limits: bool = False
+    options: Options = Options()
+
+    @cached_property
+    def system(self) -> System:
+        """Units and network, compiled."""
+        return System(self.network, groups(self.units), self.network.indices(self.sites))
+
+    def point(
+        self,
+        hosting: Mapping[int, float],
+        period: Period,
+        wrt: Sequence[Theta] = (),
+    ) -> NativePoint:
+        """Solve and initialise an operating point.
+
+        Raises
+        ------
+        SimulationError, InfeasibleError
+            When there is no power flow or no equilibrium.
+        """
+        scale = period.dc_factor * self.per_hosted
+        hosted = {bus: scale * hosting.get(bus, 0.0) for bus in self.sites}
+        load = loads(self.network, hosted, period.wind, period.load_scale)
+        network_load = (self.network.p_load + 1j * self.network.q_load) / self.network.base_mva
+        changes = directions(self.network, [(q.kind, q.bus) for q in wrt], scale, network_load)
+        where = f"{self.network.name}, {period.name}"
+        return NativePoint(self.system, load, changes, self.rule, self.reactive_limits, where)
+
+    def simulate(
+        self, point: NativePoint, fault: Fault, times: Sequence[Floats], wrt: Sequence[Theta] = ()
+    ) -> Simulated:
+        """One fault from a point; `wrt` as the point was made with."""
+        stages = fault.stages(self.network)
+        refuse_islands(self.network, stages, f"{point.where}, fault at {fault.label}")
+        clear = np.array([float(q.kind == "clear") for q in wrt])
+        last = len(stages) - 1
+        return point.simulate(stages, times, self.options, {last: clear} if clear.any() else None)
+
+
+def sample_times(stages: Sequence[Stage], until: float, step: float) -> list[Floats]:
+    """Even sample times in every stage; each has its own two ends."""
+    ends = [*(stage.begin for stage in stages[1:]), until]
+    return [
+        np.linspace(stage.begin, end, int(np.ceil((end - stage.begin) / step - 1e-9)) + 1)
+        for stage, end in zip(stages, ends, strict=True)
+    ]

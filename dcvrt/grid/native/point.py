@@ -1,0 +1,258 @@
+"""An operating point of the native engine: power flow, equilibrium of all units, fault after fault from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from dcvrt.errors import SimulationError
+from dcvrt.grid.faults import Stage
+from dcvrt.grid.native import ports as network_ports
+from dcvrt.grid.native.build import unit_objects
+from dcvrt.grid.native.fleet import Equilibrium, Group
+from dcvrt.grid.native.ports import Ports
+from dcvrt.grid.native.steady import Flow
+from dcvrt.grid.native.run import Fleet, Layout, NetworkTable, Options, Simulated, simulate
+from dcvrt.grid.network import Network
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Phasors = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A grid with its units, compiled once for all operating points.
+
+    Parameters
+    ----------
+    network : Network
+    groups : sequence of Group
+    points : int array
+        Positions of the buses whose voltage is asked for.
+    """
+
+    network: Network
+    groups: tuple[Group, ...]
+    points: Integers
+
+    @cached_property
+    def flow(self) -> Flow:
+        """Power flow of the network."""
+        return Flow(self.network)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Units in lanes, with their compiled equations."""
+        return Layout(self.groups, tuple(unit_objects([g.structure for g in self.groups])))
+
+    @cached_property
+    def unit_bus(self) -> Integers:
+        """Bus position of every unit, counted through the groups."""
+        return self.network.indices([u.bus for g in self.groups for u in g.units])
+
+    @cached_property
+    def buses(self) -> Integers:
+        """Buses with a port or a point, each once."""
+        return np.unique(np.r_[self.unit_bus, self.points])
+
+    @cached_property
+    def places(self) -> tuple[Integers, npt.NDArray[np.bool_], Integers]:
+        """Among `buses`: place of every port, whether it feeds a current, place of every point."""
+        unit, real = self.layout.unit_of_port()
+        return (
+            np.searchsorted(self.buses, self.unit_bus[unit]),
+            real,
+            np.searchsorted(self.buses, self.points),
+        )
+
+
+class NativePoint:
+    """A solved and initialised operating point.
+
+    Parameters
+    ----------
+    system : System
+    load : complex array (buses,)
+        All that the buses take, pu.
+    dload : complex array (buses, parameters)
+        Its derivatives.
+    rule : str
+        How the units share the change of load.
+    reactive_limits : bool
+    where : str
+        What messages call it.
+
+    Raises
+    ------
+    SimulationError, InfeasibleError
+        When power flow or equilibrium has no solution.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        load: Phasors,
+        dload: Phasors,
+        rule: str,
+        reactive_limits: bool,
+        where: str,
+    ) -> None:
+        self.system, self.where = system, where
+        self.steady = system.flow.solve(load, rule, reactive_limits, where)
+        v, d = self.steady.v, dload.shape[1]
+        if d:
+            self._dv, self._dgeneration = self.steady.derivatives(dload)
+        else:
+            self._dv = self._dgeneration = np.zeros((len(v), 0), dtype=complex)
+        self._dload = dload
+        self.rest: list[Equilibrium] = []
+        self._dx: list[Floats] = []
+        self._dset: list[Floats] = []
+        first = 0
+        for group in system.groups:
+            own = system.unit_bus[first : first + len(group.units)]
+            first += len(group.units)
+            current, moved = self._currents(group, own)
+            rest = group.equilibrium(v[own], current, where)
+            dx, dset = rest.derivatives(self._dv[own], moved)
+            self.rest.append(rest)
+            self._dx.append(dx)
+            self._dset.append(dset)
+
+    def _currents(self, group: Group, at: Integers) -> tuple[Phasors, Phasors]:
+        """Current of each unit into the network, from its part of the generation at its bus."""
+        v, dv = self.steady.v[at], self._dv[at]
+        p, q = (np.array([getattr(u, f"share_{x}") for u in group.units]) for x in "pq")
+        power, moved = self.steady.generation[at], self._dgeneration[at]
+        s = p * power.real + 1j * q * power.imag
+        ds = p[:, None] * moved.real + 1j * q[:, None] * moved.imag
+        current = (s / v).conj()
+        return current, ((ds - current.conj()[:, None] * dv) / v[:, None]).conj()
+
+    @property
+    def v0(self) -> Phasors:
+        """Bus voltages before the fault, pu."""
+        return self.steady.v
+
+    @cached_property
+    def residual(self) -> float:
+        """Largest residual of the equilibrium."""
+        return max((rest.residual for rest in self.rest), default=0.0)
+
+    @cached_property
+    def fleet(self) -> Fleet:
+        """The units, ready to run."""
+        return Fleet(self.system.layout, self.rest, self._dx, self._dset, len(self.system.points))
+
+    # -- networks ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _diagonal(self) -> Phasors:
+        """Loads at their voltage before the fault, and what the network holds for the units."""
+        y = self.steady.load.conj() / abs(self.v0) ** 2
+        shunts = np.concatenate([*(g.shunts() for g in self.system.groups), np.zeros(0)])
+        np.add.at(y, self.system.unit_bus, shunts)
+        return y
+
+    @cached_property
+    def _ddiagonal(self) -> Phasors | None:
+        """Derivatives of the loads' admittance."""
+        if not self._dload.shape[1]:
+            return None
+        size = abs(self.v0)[:, None]
+        d_size = (self.v0.conj()[:, None] * self._dv).real / size
+        load = self.steady.load[:, None]
+        return self._dload.conj() / size**2 - 2.0 * load.conj() / size**3 * d_size
+
+    def _ports(self, out: frozenset[int]) -> Ports:
+        if out not in self._topologies:
+            network = self.system.network
+            y = network.admittance_without(out) if out else network.admittance()
+            self._topologies[out] = Ports((y + sp.diags(self._diagonal)).tocsc(), self.system.buses)
+        return self._topologies[out]
+
+    @cached_property
+    def _topologies(self) -> dict[frozenset[int], Ports]:
+        return {}
+
+    def _network(self, stage: Stage) -> NetworkTable:
+        network = self.system.network
+        out = frozenset(stage.out)
+        shunts = {network.index(bus): y for bus, y in stage.shunts.items()}
+        z, dz = self._ports(out).impedances(shunts, self._ddiagonal)
+        return network_ports.table(z, dz, *self.system.places)
+
+    @cached_property
+    def _before(self) -> NetworkTable:
+        return self._network(Stage(0.0))
+
+    # -- faults --------------------------------------------------------------------------------------------
+
+    def simulate(
+        self,
+        stages: Sequence[Stage],
+        times: Sequence[Floats],
+        options: Options,
+        moves: Mapping[int, Floats] | None = None,
+    ) -> Simulated:
+        """Voltages at the points through the stages of a fault.
+
+        Parameters
+        ----------
+        stages : sequence of Stage
+            The first is the network as it is, from time 0.
+        times : sequence of arrays
+            Sample times of each stage; each begins and ends with the ends of the stage.
+        moves : mapping of stage number to array (parameters,), optional
+            Derivative of the time at which the stage begins.
+        """
+        d = self._dload.shape[1]
+        still = np.zeros(d)
+        pieces = []
+        for k, (stage, samples) in enumerate(zip(stages, times, strict=True)):
+            if not k:
+                continue
+            unchanged = not stage.shunts and not stage.out
+            network = self._before if unchanged else self._network(stage)
+            pieces.append((float(samples[0]), float(samples[-1]), network, samples, (moves or {}).get(k, still)))
+        unit, _ = self.system.layout.unit_of_port()
+        v_start = self.v0[self.system.unit_bus[unit]]
+        found = simulate(self.fleet, pieces, v_start, options)
+        at = self.system.points
+        before = np.tile(self.v0[at], (len(times[0]), 1))
+        d_before = np.tile(self._dv[at].T[None], (len(times[0]), 1, 1))
+        return Simulated(
+            np.concatenate([before, found.v]),
+            np.concatenate([d_before, found.tangents]),
+            found.status,
+            found.events,
+            found.steps,
+            found.rejected,
+        )
+
+
+def islands(network: Network, out: Sequence[int]) -> list[int]:
+    """Buses that lose their path to the slack bus when branches are open."""
+    keep = np.setdiff1d(np.arange(len(network.branches)), np.array(list(out), dtype=int))
+    incidence = network.incidence[keep]
+    _, island = connected_components(abs(incidence.T) @ abs(incidence), directed=False)
+    return [int(b) for b in network.bus[island != island[network.slack]]]
+
+
+def refuse_islands(network: Network, stages: Sequence[Stage], where: str) -> None:
+    """Raise `SimulationError` when a stage cuts buses off."""
+    for stage in stages:
+        cut = islands(network, sorted(stage.out)) if stage.out else []
+        if cut:
+            lines = ", ".join(network.branches.label(k) for k in sorted(stage.out))
+            shown = ", ".join(map(str, cut[:8])) + (", ..." if len(cut) > 8 else "")
+            raise SimulationError(
+                f"{where}: with {lines} open, {len(cut)} bus(es) are islanded: {shown}. Islands are not simulated."
+            )

@@ -1,0 +1,375 @@
+"""Fault simulation of an operating point with the compiled engine."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import POINTER, byref, c_long, pointer
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dcvrt.grid.native import build
+from dcvrt.grid.native.build import (
+    DOUBLES,
+    LONGS,
+    FleetStruct,
+    GroupStruct,
+    NetworkStruct,
+    OptionsStruct,
+    RecordStruct,
+    StretchStruct,
+    UnitObject,
+)
+from dcvrt.grid.native.fleet import Equilibrium, Group
+
+Floats = npt.NDArray[np.float64]
+Phasors = npt.NDArray[np.complex128]
+BLOCK = 8
+EVENT_ROOM = 4096
+ALIGNMENT = 64
+STATUSES = {
+    0: "",
+    1: "left its valid range",
+    2: "chattered",
+    4: "the step became too small",
+    5: "too many steps",
+    6: "a state is no number",
+    7: "voltage collapse or numerical failure: no voltages satisfy the network's equations",
+    8: "lost synchronism",
+    9: "out of memory",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Tolerances of a fault simulation.
+
+    Parameters
+    ----------
+    rtol, atol : float
+        Error of a step, relative and absolute, of every state.
+    theta_rtol : float
+        Error of a derivative, relative to itself plus `theta_share` of the largest one by the same parameter.
+    theta_share : float
+    longest : float
+        Longest step, s.
+    out_of_step : float
+        Angle from the centre of inertia, rad, from which on a rotor counts as out of step.
+    max_steps : int
+    """
+
+    rtol: float = 1e-6
+    atol: float = 1e-6
+    theta_rtol: float = 1e-4
+    theta_share: float = 1e-2
+    longest: float = 0.1
+    out_of_step: float = np.pi
+    max_steps: int = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where units stand among ports and states; the same for every operating point."""
+
+    groups: tuple[Group, ...]
+    objects: tuple[UnitObject, ...]
+
+    @property
+    def lanes(self) -> int:
+        return self.objects[0].lanes if self.objects else BLOCK
+
+    @property
+    def packs(self) -> list[int]:
+        return [-(-len(g.units) // self.lanes) for g in self.groups]
+
+    @property
+    def ports(self) -> int:
+        """Ports, those of lanes without a unit included; a multiple of the rows of a block."""
+        return -(-sum(self.packs) * self.lanes // BLOCK) * BLOCK
+
+    def unit_of_port(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+        """For each port the number of its unit, counted through the groups, and whether it is not a repeat."""
+        unit, real, first = [], [], 0
+        for group, packs in zip(self.groups, self.packs, strict=True):
+            n = len(group.units)
+            own = np.minimum(np.arange(packs * self.lanes), n - 1)
+            unit.append(first + own)
+            real.append(np.arange(packs * self.lanes) < n)
+            first += n
+        unit_ = np.concatenate([*unit, np.zeros(0, dtype=np.int64)])
+        rest = self.ports - len(unit_)
+        return np.r_[unit_, np.full(rest, first - 1)], np.r_[np.concatenate(real), np.zeros(rest, dtype=bool)]
+
+    def in_lanes(self, values: Floats, packs: int) -> Floats:
+        """(units, ...) as (packs, ..., lanes)."""
+        own = np.minimum(np.arange(packs * self.lanes), len(values) - 1)
+        spread = values[own].reshape(packs, self.lanes, *values.shape[1:])
+        return np.ascontiguousarray(np.moveaxis(spread, 1, -1), dtype=float)
+
+
+def _aligned(array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    """A contiguous copy that begins where a vector register may be loaded from."""
+    room = np.empty(array.nbytes + ALIGNMENT, dtype=np.uint8)
+    skip = -room.ctypes.data % ALIGNMENT
+    copy = room[skip : skip + array.nbytes].view(array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy
+
+
+def _pointer(array: npt.NDArray[np.float64]) -> ctypes._Pointer[ctypes.c_double]:
+    return array.ctypes.data_as(DOUBLES)
+
+
+@dataclass(eq=False)
+class NetworkTable:
+    """Impedances of one network as the engine reads them.
+
+    Parameters
+    ----------
+    z : complex array (ports + points, ports)
+        Rows of points are filled up to whole blocks.
+    dz : sequence of such arrays or None, one a parameter
+    """
+
+    z: Phasors
+    dz: Sequence[Phasors | None]
+
+    def __post_init__(self) -> None:
+        self._z = _blocks(self.z)
+        self._dz = [None if d is None else _blocks(d) for d in self.dz]
+        self._pointers = (DOUBLES * max(len(self._dz), 1))(
+            *(DOUBLES() if d is None else _pointer(d) for d in self._dz)
+        )
+        self.struct = NetworkStruct(_pointer(self._z), self._pointers)
+
+
+def _blocks(z: Phasors) -> Floats:
+    rows, columns = z.shape
+    blocks = z.reshape(rows // BLOCK, BLOCK, columns).transpose(0, 2, 1)
+    return np.ascontiguousarray(np.stack([blocks.real, blocks.imag], axis=2))
+
+
+class Fleet:
+    """Units at an operating point, ready to run: parameters, states and modes in lanes."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        rest: Sequence[Equilibrium],
+        dx: Sequence[Floats],
+        dset: Sequence[Floats],
+        points: int,
+    ) -> None:
+        self.layout, self.points = layout, points
+        self.directions = dx[0].shape[-1] if dx else 0
+        self._keep: list[object] = []
+        self._start: list[tuple[npt.NDArray[np.generic], npt.NDArray[np.generic]]] = []
+        d, lanes = self.directions, layout.lanes
+        rows = layout.ports + -(-points // BLOCK) * BLOCK
+        structs, x, xs, port, state = [], [], [], 0, 0
+        for group, packs, obj, eq, gx, gs in zip(
+            layout.groups, layout.packs, layout.objects, rest, dx, dset, strict=True
+        ):
+            structs.append(self._group(group, packs, obj, eq, gs, layout.ports, rows, port, state))
+            x.append(layout.in_lanes(eq.x, packs).ravel())
+            xs.append(layout.in_lanes(gx.transpose(0, 2, 1), packs).ravel())
+            port += packs * lanes
+            state += packs * lanes * eq.x.shape[1]
+        self.x, self.xs = np.concatenate([*x, np.zeros(0)]), np.concatenate([*xs, np.zeros(0)])
+        self._structs = structs
+        self._table = (POINTER(GroupStruct) * max(len(structs), 1))(*(pointer(s) for s in structs))
+        self.struct = FleetStruct(len(structs), self._table, layout.ports, points, state, d, lanes)
+
+    def _held(self, array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+        self._keep.append(array)
+        return array
+
+    def _group(
+        self,
+        group: Group,
+        packs: int,
+        obj: UnitObject,
+        eq: Equilibrium,
+        dset: Floats,
+        ports: int,
+        rows: int,
+        port: int,
+        state: int,
+    ) -> GroupStruct:
+        dae, d, lanes = group.structure.dae, self.directions, self.layout.lanes
+        automata, table = dae.automata, group.structure.rows
+        flags = [np.asarray(a.flags, dtype=float).reshape(len(a.modes), -1) for a in automata]
+        widths = [f.shape[1] for f in flags]
+        begins = np.cumsum([0, *(f.size for f in flags)])[:-1]
+        start = np.concatenate([*(f[a.mode_number(a.start)] for a, f in zip(automata, flags, strict=True)), []])
+        held = group.held(eq.p)
+        moving = len(group.structure.moving)
+        seeds = dset.transpose(0, 2, 1)
+        structure = group.structure
+
+        def doubles(array: Floats) -> object:
+            return _pointer(self._held(_aligned(np.asarray(array, dtype=float))))  # type: ignore[arg-type]
+
+        def longs(values: Sequence[int]) -> object:
+            return self._held(np.array([*values, 0], dtype=c_long)).ctypes.data_as(LONGS)
+
+        def varying(array: npt.NDArray[np.generic], kind: object) -> object:
+            """An array that a run changes: kept with its first values."""
+            array = _aligned(array)
+            self._start.append((array, array.copy()))
+            return array.ctypes.data_as(kind)
+
+        inertia = np.zeros(len(group.units))
+        if group.inertia:
+            inertia = eq.p[:, dae.parameter_number(group.inertia)]
+        mass = self.layout.in_lanes(inertia, packs)
+        mass.ravel()[len(group.units) :] = 0.0
+        many = packs * lanes
+        struct = GroupStruct(
+            packs=packs, nx=dae.x.numel(), np=eq.p.shape[1], nq=len(start), na=len(automata), rows=len(table),
+            bounds=len(structure.bounds), moving=moving, fixed=obj.fixed, fixed_columns=obj.fixed_columns,
+            ports=ports, v_rows=rows, first_port=port, first_state=state, reads_v=int(not structure.affine),
+            angle=dae.x_names.index(structure.angle) if structure.angle else -1,
+            p=doubles(self.layout.in_lanes(eq.p, packs)), moving_seed=doubles(self.layout.in_lanes(seeds, packs)),
+            held=doubles(self.layout.in_lanes(held, packs)), inertia=doubles(mass),
+            q=varying(np.repeat(np.tile(start, packs), lanes), DOUBLES),
+            entry=varying(np.zeros(many * max(len(automata), 1)), DOUBLES),
+            entries=varying(np.zeros(many * max(len(automata) * d, 1)), DOUBLES),
+            since=varying(np.full(many * max(len(table), 1), np.inf), DOUBLES),
+            sinces=varying(np.zeros(many * max(len(table) * d, 1)), DOUBLES),
+            kept=doubles(np.zeros(many * max(obj.fixed, 1))),
+            kept_columns=doubles(np.zeros(many * max(obj.fixed_columns * d, 1))),
+            no_columns=doubles(np.zeros(many * max(obj.fixed_columns, len(automata), 1))),
+            mode=varying(
+                np.repeat(np.tile(np.array([a.mode_number(a.start) for a in automata] or [0]), packs), lanes).astype(
+                    c_long
+                ),
+                LONGS,
+            ),
+            row_automaton=longs([a for a, _ in table]),
+            row_source=longs([automata[a].mode_number(r.source) for a, r in table]),  # type: ignore[attr-defined]
+            row_target=longs([automata[a].mode_number(r.target) for a, r in table]),  # type: ignore[attr-defined]
+            row_resets=longs([int(bool(r.reset)) for _, r in table]),  # type: ignore[attr-defined]
+            flag_begin=longs(begins.tolist()), flag_width=longs(widths),
+            flag_values=doubles(np.concatenate([*(f.ravel() for f in flags), [0.0]])),
+            call=obj.functions,
+        )  # fmt: skip
+        return struct
+
+    def restart(self) -> None:
+        """Put modes and timers back to where a run begins."""
+        for array, first in self._start:
+            array[...] = first
+
+    def hoist(self) -> None:
+        """Compute what depends on parameters and flags alone."""
+        call = ctypes.CFUNCTYPE(None, POINTER(GroupStruct), c_long, c_long)
+        for struct, obj in zip(self._structs, self.layout.objects, strict=True):
+            function = call((ctypes.c_void_p * 6).from_address(obj.functions)[5])
+            for pack in range(struct.packs):
+                function(byref(struct), pack, self.directions)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """What a run leaves.
+
+    Parameters
+    ----------
+    v : complex array (samples, points)
+    tangents : complex array (samples, parameters, points)
+    status : str
+        Empty when the end was reached.
+    events : tuple of (time, unit, row)
+    steps, rejected : int
+    """
+
+    v: Phasors
+    tangents: Phasors
+    status: str
+    events: tuple[tuple[float, str, str], ...]
+    steps: int
+    rejected: int
+
+
+def simulate(
+    fleet: Fleet,
+    stretches: Sequence[tuple[float, float, NetworkTable, Floats, Floats]],
+    v_start: Phasors,
+    options: Options,
+) -> Simulated:
+    """Run through stretches of constant networks.
+
+    Parameters
+    ----------
+    fleet : Fleet
+    stretches : sequence of (from, to, network, samples, derivative of `from`)
+    v_start : complex array (ports,)
+        Voltages just before.
+    options : Options
+    """
+    dll = build.network_library()
+    fleet.restart()
+    fleet.hoist()
+    points, d = fleet.points, fleet.directions
+    padded = points
+    count = sum(len(s[3]) for s in stretches)
+    v = np.zeros((count, 2, padded))
+    vs = np.zeros((count, max(d, 1), 2, padded))
+    events = np.zeros((EVENT_ROOM, 4))
+    record = RecordStruct(v=_pointer(v), vs=_pointer(vs), events=_pointer(events), event_room=EVENT_ROOM)
+    held = [
+        (np.ascontiguousarray(samples, dtype=float), np.ascontiguousarray(np.r_[moves, 0.0], dtype=float))
+        for *_, samples, moves in stretches
+    ]
+    table = (StretchStruct * len(stretches))(
+        *(
+            StretchStruct(a, b, _pointer(moves), pointer(network.struct), len(samples), _pointer(samples))
+            for (a, b, network, *_), (samples, moves) in zip(stretches, held, strict=True)
+        )
+    )
+    x, xs = fleet.x.copy(), np.r_[fleet.xs, 0.0]
+    start = np.r_[v_start.real, v_start.imag].astype(float)
+    o = options
+    settings = OptionsStruct(o.rtol, o.atol, o.theta_rtol, o.theta_share, o.longest, o.out_of_step, o.max_steps)
+    code = dll.fleet_run(
+        byref(fleet.struct), byref(settings), len(stretches), table, _pointer(x), _pointer(xs), _pointer(start),
+        byref(record),
+    )  # fmt: skip
+    done = record.n_samples
+    named = tuple(_event(fleet, events[k]) for k in range(min(record.n_events, EVENT_ROOM)))
+    return Simulated(
+        v[:done, 0] + 1j * v[:done, 1],
+        (vs[:done, :, 0] + 1j * vs[:done, :, 1])[:, :d],
+        _status(fleet, code, record),
+        tuple(e for e in named if e[1]),
+        record.steps,
+        record.rejected,
+    )
+
+
+def _event(fleet: Fleet, event: Floats) -> tuple[float, str, str]:
+    group, unit = fleet.layout.groups[int(event[1])], int(event[3])
+    name = group.units[unit].name if unit < len(group.units) else ""  # a lane that repeats the last unit
+    _, row = group.structure.rows[int(event[2])]
+    return float(event[0]), name, row.text  # type: ignore[attr-defined]
+
+
+def _status(fleet: Fleet, code: int, record: RecordStruct) -> str:
+    if not code:
+        return ""
+    text = f"{STATUSES[code]} at t = {record.t:.4f} s"
+    if code in (1, 2, 8) and fleet.layout.groups:
+        group = fleet.layout.groups[record.group]
+        unit = group.units[min(record.unit, len(group.units) - 1)]
+        text += f": {unit.name} at bus {unit.bus}"
+        if code == 8:
+            text += f" is {np.rad2deg(abs(record.amount)):.0f} deg from the centre of inertia"
+        elif code == 2:
+            text += f", {group.structure.rows[record.row][1].text}"  # type: ignore[attr-defined]
+        else:
+            state = group.structure.dae.states[group.structure.bounds[record.row][0]]
+            text += f", {state.path}" + (f" ({state.crossing})" if state.crossing else "")
+    return text + "."
