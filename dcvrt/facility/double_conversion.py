@@ -147,7 +147,7 @@ def gfl_vfd_cooling() -> Diagram:
     f.connect(drive.energy, ledger.drive_energy)
     f.connect(drive.loss, ledger.drive_loss)
 
-    _name_outputs(f, p_g=site.p, q_g=site.q, i_g=site.i_mag, i_max=site.i_max, p_out=load.served)
+    _name_outputs(f, p_g=site.p, q_g=site.q, i_g=site.i_mag, i=site.drawn, i_max=site.i_max, p_out=load.served)
     f.output("p_ups", f.port("poi.p"))
     f.output("i_ups", f.port("poi.i_mag"))
     f.output("w_drive", drive.w)
@@ -304,7 +304,7 @@ def _ups(
 def _name_outputs(f: Diagram, **others: Port) -> None:
     """The outputs that every variant has, some of them from other places than usual."""
     usual = {
-        "v_it": "bus.v", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i_max": "lim.i_max",
+        "v_it": "bus.v", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i": "poi.drawn", "i_max": "lim.i_max",
         "p_b": "bess.p", "soc": "bess.soc", "w_dc": "dc.w",
         "p_load": "load.demand", "p_out": "load.p", "p_it": "psu.p", "p_cool": "cooling.p",
         "mode": "sup.mode", "stored": "ledger.stored", "p_loss": "ledger.loss",

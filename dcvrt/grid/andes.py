@@ -279,6 +279,7 @@ def read_network(path: Path, dynamics: Path | None, name: str) -> Network:
             q_max=unit[:, 5],
             name=tuple(f"unit {k + 1} at bus {int(x)}" for k, x in enumerate(unit[:, 0])),
         ),
+        slack_angle=float(system.Slack.a0.v[0]) if system.Slack.n else 0.0,
     )
 
 

@@ -17,6 +17,7 @@ from dcvrt.grid.native.engine import Engine, sample_times, thetas
 from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
+from dcvrt.models import Diagram
 from dcvrt.waveform import Waveform
 
 Floats = npt.NDArray[np.float64]
@@ -169,7 +170,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, object] | None = None,
+        facilities: Mapping[int, Diagram] | None = None,
     ) -> dict[int, Waveform]:
         """POI voltage at every site under one fault.
 
@@ -191,6 +192,10 @@ class Grid:
             Quantities that the waveforms carry tangents of, with `native`: `H` (every site) or `H_<bus>`, MW;
             `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
             cleared, s.
+        facilities : mapping of site to Diagram, optional
+            Facilities that act back on the network, with `native`; what is hosted at other sites is a constant
+            impedance in the fault. Each has the site's capacity, the period's load factor and the grid's power
+            factor; its own `beta`.
 
         Returns
         -------
@@ -220,7 +225,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, object] | None = None,
+        facilities: Mapping[int, Diagram] | None = None,
     ) -> dict[Fault, FaultRun]:
         """Several faults of one operating point, which is solved and initialised once; see `waveforms`.
 
@@ -232,7 +237,7 @@ class Grid:
         once = list(dict.fromkeys(faults))
         found = self._by_andes if engine == "andes" else self._by_own_engine
         runs = {}
-        for fault, (t, v, tangents, status) in found(hosting, period, once, until, step, wrt):
+        for fault, (t, v, tangents, status) in found(hosting, period, once, until, step, wrt, facilities):
             name = f"{self.name}, {period.name}, fault at {fault.label}"
             reached = () if status else enumerate(self.sites)
             waveforms = {
@@ -252,6 +257,7 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
+        facilities: Mapping[int, Diagram] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         bolted = [fault for fault in faults if isinstance(fault, BusFault)]
         point = self.operating_point(hosting, period, bolted)
@@ -268,9 +274,10 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
+        facilities: Mapping[int, Diagram] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         by = thetas(wrt, self.sites, self.network)
-        point = self.native.point(hosting, period, by)
+        point = self.native.point(hosting, period, by, facilities)
         for fault in faults:
             times = sample_times(fault.stages(self.network), until, step)
             try:
@@ -352,7 +359,7 @@ class Grid:
         engine: str,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, object] | None,
+        facilities: Mapping[int, Diagram] | None,
     ) -> None:
         problems = []
         if engine not in ENGINES:
@@ -372,11 +379,13 @@ class Grid:
             ]
         else:
             problems += _problems(thetas, wrt, self.sites, self.network)
-        if facilities is not None:
-            problems.append(
-                "facilities: coupling them into the network is not available. Way out: run each facility on the "
-                "waveform that this call returns without facilities=."
-            )
+        if facilities and engine == "andes":
+            problems.append("facilities: ANDES has no model of them. Way out: engine='native'.")
+        problems += [
+            f"facilities: bus {bus} is not a candidate site.{did_you_mean(bus, self.sites)}"
+            for bus in facilities or {}
+            if bus not in self.sites
+        ]
         for bus, mw in hosting.items():
             if bus not in self.sites:
                 problems.append(f"hosting at bus {bus}: not a candidate site.{did_you_mean(bus, self.sites)}")

@@ -116,6 +116,8 @@ class Network:
         Voltage that `pv` and `slack` buses hold, pu; the start value elsewhere.
     branches : Branches
     generators : Generators
+    slack_angle : float
+        Angle of the voltage at the slack bus, rad.
 
     Raises
     ------
@@ -135,6 +137,7 @@ class Network:
     v_set: Floats
     branches: Branches
     generators: Generators
+    slack_angle: float = 0.0
 
     def __post_init__(self) -> None:
         _freeze(self)

@@ -25,10 +25,11 @@ class Poi(Block):
     p = Output("pu(S)", "active-power import")
     q = Output("pu(S)", "reactive-power import")
     i_mag = Output("pu(I)", "magnitude of the current")
+    drawn = Output("pu(I)", "current drawn, network frame", kind=Phasor)
 
     def equations(self, s: Any) -> Equations:
         power = s.v * s.i.conj()
-        return Equations(out=dict(p=power.re, q=power.im, i_mag=smooth.mag(s.i, s.eps)))
+        return Equations(out=dict(p=power.re, q=power.im, i_mag=smooth.mag(s.i, s.eps), drawn=s.i))
 
 
 class SharedPoi(Block):
@@ -52,13 +53,15 @@ class SharedPoi(Block):
     q = Output("pu(S)", "reactive-power import")
     i_mag = Output("pu(I)", "magnitude of the current")
     i_max = Output("pu(I)", "largest current of the site")
+    drawn = Output("pu(I)", "current drawn, network frame", kind=Phasor)
 
     def equations(self, s: Any) -> Equations:
         i = s.ups + s.direct
         power = s.v * i.conj()
-        return Equations(
-            out=dict(p=power.re, q=power.im, i_mag=smooth.mag(i, s.eps), i_max=s.ups_max + s.direct_max)
+        out = dict(
+            p=power.re, q=power.im, i_mag=smooth.mag(i, s.eps), i_max=s.ups_max + s.direct_max, drawn=i
         )
+        return Equations(out=out)
 
 
 class VoltageFilter(Block):

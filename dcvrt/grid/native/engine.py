@@ -17,9 +17,10 @@ from dcvrt.grid.native.fleet import Group, Unit
 from dcvrt.grid.native.point import NativePoint, System, refuse_islands
 from dcvrt.grid.native.run import Options, Simulated
 from dcvrt.grid.native.steady import directions, loads
-from dcvrt.grid.native.text import Structure
+from dcvrt.grid.native.text import SCALE, Structure
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
+from dcvrt.models import Diagram
 from dcvrt.models.machines import setpoints
 
 Floats = npt.NDArray[np.float64]
@@ -139,6 +140,7 @@ class Engine:
         hosting: Mapping[int, float],
         period: Period,
         wrt: Sequence[Theta] = (),
+        facilities: Mapping[int, Diagram] | None = None,
     ) -> NativePoint:
         """Solve and initialise an operating point.
 
@@ -147,13 +149,49 @@ class Engine:
         SimulationError, InfeasibleError
             When there is no power flow or no equilibrium.
         """
+        network, coupled = self.network, self._coupled(hosting, period, facilities or {})
+        own = {unit.bus for group in coupled for unit in group.units}
         scale = period.dc_factor * self.per_hosted
-        hosted = {bus: scale * hosting.get(bus, 0.0) for bus in self.sites}
-        load = loads(self.network, hosted, period.wind, period.load_scale)
-        network_load = (self.network.p_load + 1j * self.network.q_load) / self.network.base_mva
-        changes = directions(self.network, [(q.kind, q.bus) for q in wrt], scale, network_load)
-        where = f"{self.network.name}, {period.name}"
-        return NativePoint(self.system, load, changes, self.rule, self.reactive_limits, where)
+        hosted = {bus: 0j if bus in own else scale * hosting.get(bus, 0.0) for bus in self.sites}
+        load = loads(network, hosted, period.wind, period.load_scale)
+        network_load = (network.p_load + 1j * network.q_load) / network.base_mva
+        outside = [("", None) if q.kind == "H" and q.bus in own else (q.kind, q.bus) for q in wrt]
+        changes = directions(network, outside, scale, network_load)
+        sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
+        for row, unit in enumerate(unit for group in coupled for unit in group.units):
+            sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
+        system = self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
+        where = f"{network.name}, {period.name}"
+        return NativePoint(system, load, changes, sizes, self.rule, self.reactive_limits, where)
+
+    def _coupled(
+        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram]
+    ) -> tuple[Group, ...]:
+        """Facilities as units of the grid, those of one diagram together; a site that hosts nothing has none."""
+        by_diagram: dict[int, list[int]] = {}
+        for bus, diagram in facilities.items():
+            if hosting.get(bus, 0.0) > 0:
+                by_diagram.setdefault(id(diagram), []).append(bus)
+        pf = float(np.cos(np.angle(self.per_hosted)))
+        given = {"H": 1.0, "d": period.dc_factor, "pf": pf}
+        made = []
+        for buses in by_diagram.values():
+            diagram = facilities[buses[0]]
+            if diagram not in self._structures:
+                self._structures[diagram] = Structure(diagram.compile(), "v_poi", "i", -1.0, (SCALE,))
+            structure = self._structures[diagram]
+            known = {path: value for path, value in given.items() if path in structure.dae.p_names}
+            structure.dae.parameter_values(**known)
+            units = [
+                Unit(f"facility {diagram.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
+                for bus in buses
+            ]
+            made.append(Group(structure, units))
+        return tuple(made)
+
+    @cached_property
+    def _structures(self) -> dict[Diagram, Structure]:
+        return {}
 
     def simulate(
         self, point: NativePoint, fault: Fault, times: Sequence[Floats], wrt: Sequence[Theta] = ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -69,17 +69,32 @@ class Group:
         """Parameters (units, parameters of the structure); set-points and shunts still to be filled in."""
         dae = self.structure.dae
         rest = [row.value for row in dae.inputs if row.path in self.structure.others]
-        default = np.array([*(row.value for row in dae.parameter_rows), *rest, 0.0, 0.0])
+        default = np.array([*(row.value for row in dae.parameter_rows), *rest, 1.0, 0.0, 0.0])
         p = np.tile(default, (len(self.units), 1))
         for k, unit in enumerate(self.units):
             for path, value in unit.values.items():
-                p[k, dae.parameter_number(path)] = value
+                p[k, self.structure.column(path)] = value
+        if not self.structure.affine:
+            p[:, -2:] = self._typical_shunt(p)
         return p
+
+    def _typical_shunt(self, p: Floats) -> Floats:
+        """Mean slope of the current at rest values: it leaves little for the iteration over voltages."""
+        s, dae = self.structure, self.structure.dae
+        x = np.array([row.value for row in dae.states])
+        at = ca.substitute(
+            [ca.densify(s.slope)],
+            [dae.q, dae.clocks, dae.t, dae.x, s.v],
+            [self._flags, ca.SX.zeros(len(dae.automata)), 0, ca.DM(x), ca.DM([1.0, 0.0])],
+        )[0]
+        slopes = np.array(ca.Function("typical", [s.p], [at]).map(len(p))(p.T)).reshape(2, len(p), 2)
+        mean = 0.5 * np.stack([slopes[0, :, 0] + slopes[1, :, 1], slopes[1, :, 0] - slopes[0, :, 1]], axis=1)
+        return np.where(np.isfinite(mean), -mean, 0.0)
 
     @cached_property
     def setpoint_columns(self) -> list[int]:
         """Positions of the set-points among the parameters."""
-        return [self.structure.dae.parameter_number(path) for path in self.setpoints]
+        return [self.structure.column(path) for path in self.setpoints]
 
     # -- functions of many units, interpreted --------------------------------------------------------------
 
@@ -95,7 +110,7 @@ class Group:
         s, dae = self.structure, self.structure.dae
         clocks = ca.SX.zeros(len(dae.automata))
         wanted = ca.SX.sym("current", 2)
-        columns = [dae.p[k] for k in self.setpoint_columns]
+        columns = [s.p[k] for k in self.setpoint_columns]
         unknown = ca.vertcat(dae.x, *columns)
         residual = ca.vertcat(dae.f, s.i - wanted) if self.setpoints else dae.f
         own = [dae.q, dae.clocks, dae.t]
@@ -160,28 +175,37 @@ class Group:
         rest = self._rest.map(n)
         columns = self.setpoint_columns
         nx, size = dae.x.numel(), dae.x.numel() + len(columns)
+        last = np.full(n, np.inf)
         for step in range(STEPS + 1):
-            residual, jacobian, by_v, guards, _, slopes = (np.array(a) for a in rest(x.T, volts, p.T, current))
-            r = residual.T
-            if np.abs(r).max(initial=0.0) < TOLERANCE or not np.isfinite(r).all() or step == STEPS:
+            residual, jacobian, by_v, guards, now, slopes = (
+                np.array(a) for a in rest(x.T, volts, p.T, current)
+            )
+            r, j = residual.T, jacobian.reshape(size, n, size).transpose(1, 0, 2)
+            level = np.abs(r).max(axis=1, initial=0.0)
+            settled = bool((level < TOLERANCE).all()) or (
+                step > 3 and bool((level < ACCEPTED).all() and (level >= 0.5 * last).all())
+            )
+            if settled or not np.isfinite(r).all() or step == STEPS:
                 break
-            j = jacobian.reshape(size, n, size).transpose(1, 0, 2)
+            last = level
             try:
-                move = np.linalg.solve(j, r[:, :, None])[:, :, 0]
-            except np.linalg.LinAlgError:
+                move = self._inverse(j) @ r[:, :, None]
+            except np.linalg.LinAlgError:  # singular: told below, by the residuals that are left
                 break
-            if step > 3 and np.abs(move).max() < 1e-13:
-                break
-            x -= move[:, :nx]
-            p[:, columns] -= move[:, nx:]
+            x -= move[:, :nx, 0]
+            p[:, columns] -= move[:, nx:, 0]
         self._check(r, where)
         over = guards.T if guards.size else np.zeros((n, 0))
         self._check_limits(over, where)
-        j = jacobian.reshape(size, n, size).transpose(1, 0, 2) if size else np.zeros((n, 0, 0))
         return Equilibrium(
-            self, x, p, j, by_v.reshape(size, n, 2).transpose(1, 0, 2),
-            slopes.reshape(2, n, size + 2).transpose(1, 0, 2), float(np.abs(r).max(initial=0.0)),
+            self, x, p, self._inverse(j), by_v.reshape(size, n, 2).transpose(1, 0, 2), now[0] + 1j * now[1],
+            slopes.reshape(2, n, size + 2).transpose(1, 0, 2), float(level.max(initial=0.0)),
         )  # fmt: skip
+
+    def _inverse(self, jacobian: Floats) -> Floats:
+        """Inverse Jacobians. A unit without set-points may rest anywhere along some direction, as a battery does
+        at any charge: it stays where it starts."""
+        return np.linalg.inv(jacobian) if self.setpoints else np.linalg.pinv(jacobian, rcond=1e-11)
 
     def _check(self, residual: Floats, where: str) -> None:
         worst = np.nan_to_num(np.abs(residual), nan=np.inf).max(axis=1, initial=0.0)
@@ -230,10 +254,12 @@ class Equilibrium:
     group : Group
     x : array (units, states)
     p : array (units, parameters)
-    jacobian : array (units, n, n)
-        Of the residuals by states and set-points.
+    inverse : array (units, n, n)
+        Of the Jacobian of the residuals by states and set-points.
     by_v : array (units, n, 2)
-        Of the residuals by the terminal voltage.
+        Jacobian of the residuals by the terminal voltage.
+    current : complex array (units,)
+        Into the network.
     slopes : array (units, 2, n + 2)
         Of the current by states and set-points, then by the voltage.
     residual : float
@@ -243,10 +269,11 @@ class Equilibrium:
     group: Group
     x: Floats
     p: Floats
-    jacobian: Floats
+    inverse: Floats
     by_v: Floats
-    slopes: Floats = field(repr=False)
-    residual: float = 0.0
+    current: Phasors
+    slopes: Floats
+    residual: float
 
     def derivatives(self, dv: Phasors, di: Phasors) -> tuple[Floats, Floats]:
         """Derivatives of states and set-points, for those of terminal voltages and currents (units, thetas).
@@ -256,13 +283,19 @@ class Equilibrium:
         dx : array (units, states, thetas)
         dsetpoints : array (units, set-points, thetas)
         """
-        n, d = dv.shape
         nx = self.x.shape[1]
         right = self.by_v @ np.stack([dv.real, dv.imag], axis=1)
         if self.group.setpoints:
             right[:, nx:] -= np.stack([di.real, di.imag], axis=1)
-        moved = -np.linalg.solve(self.jacobian, right) if right.shape[1] else np.zeros((n, 0, d))
+        moved = -self.inverse @ right
         return moved[:, :nx], moved[:, nx:]
+
+    def current_by_v(self, dv: Phasors) -> Phasors:
+        """Derivative of the current at rest, for those of terminal voltages (units, thetas)."""
+        moved, _ = self.derivatives(dv, np.zeros_like(dv))
+        volts = np.stack([dv.real, dv.imag], axis=1)
+        parts = self.slopes @ np.concatenate([moved, volts], axis=1)
+        return parts[:, 0] + 1j * parts[:, 1]
 
 
 def check_one_at_each_bus(groups: Sequence[Group], where: str) -> None:

@@ -18,12 +18,17 @@ from dcvrt.grid.native.build import unit_objects
 from dcvrt.grid.native.fleet import Equilibrium, Group
 from dcvrt.grid.native.ports import Ports
 from dcvrt.grid.native.steady import Flow
+from dcvrt.grid.native.text import SCALE
 from dcvrt.grid.native.run import Fleet, Layout, NetworkTable, Options, Simulated, simulate
 from dcvrt.grid.network import Network
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Phasors = npt.NDArray[np.complex128]
+
+AGREED = 1e-11
+"""Difference, pu, at which the power that facilities draw and that of the power flow agree."""
+ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +41,19 @@ class System:
     groups : sequence of Group
     points : int array
         Positions of the buses whose voltage is asked for.
+    facilities : sequence of Group
+        Dynamic loads, one unit a site.
     """
 
     network: Network
     groups: tuple[Group, ...]
     points: Integers
+    facilities: tuple[Group, ...] = ()
+
+    @property
+    def all_groups(self) -> tuple[Group, ...]:
+        """Generating units, then facilities."""
+        return (*self.groups, *self.facilities)
 
     @cached_property
     def flow(self) -> Flow:
@@ -50,12 +63,12 @@ class System:
     @cached_property
     def layout(self) -> Layout:
         """Units in lanes, with their compiled equations."""
-        return Layout(self.groups, tuple(unit_objects([g.structure for g in self.groups])))
+        return Layout(self.all_groups, tuple(unit_objects([g.structure for g in self.all_groups])))
 
     @cached_property
     def unit_bus(self) -> Integers:
         """Bus position of every unit, counted through the groups."""
-        return self.network.indices([u.bus for g in self.groups for u in g.units])
+        return self.network.indices([u.bus for g in self.all_groups for u in g.units])
 
     @cached_property
     def buses(self) -> Integers:
@@ -80,9 +93,11 @@ class NativePoint:
     ----------
     system : System
     load : complex array (buses,)
-        All that the buses take, pu.
+        All that the buses take but the facilities, pu.
     dload : complex array (buses, parameters)
         Its derivatives.
+    dscale : array (facilities, parameters)
+        Derivatives of the sizes of the facilities, counted through their groups, over the base of the system.
     rule : str
         How the units share the change of load.
     reactive_limits : bool
@@ -100,31 +115,91 @@ class NativePoint:
         system: System,
         load: Phasors,
         dload: Phasors,
+        dscale: Floats,
         rule: str,
         reactive_limits: bool,
         where: str,
     ) -> None:
-        self.system, self.where = system, where
-        self.steady = system.flow.solve(load, rule, reactive_limits, where)
-        v, d = self.steady.v, dload.shape[1]
-        if d:
-            self._dv, self._dgeneration = self.steady.derivatives(dload)
-        else:
-            self._dv = self._dgeneration = np.zeros((len(v), 0), dtype=complex)
-        self._dload = dload
+        self.system, self.where, self._load, self._dload = system, where, load, dload
+        fed = self._power_flow(rule, reactive_limits)
+        self._derivatives(fed, dscale)
+        first = 0
         self.rest: list[Equilibrium] = []
         self._dx: list[Floats] = []
         self._dset: list[Floats] = []
-        first = 0
         for group in system.groups:
             own = system.unit_bus[first : first + len(group.units)]
             first += len(group.units)
             current, moved = self._currents(group, own)
-            rest = group.equilibrium(v[own], current, where)
+            rest = group.equilibrium(self.v0[own], current, where)
             dx, dset = rest.derivatives(self._dv[own], moved)
             self.rest.append(rest)
             self._dx.append(dx)
             self._dset.append(dset)
+        seen = 0
+        for rest in fed:
+            n = len(rest.group.units)
+            own = system.unit_bus[first : first + n]
+            first += n
+            dx, _ = rest.derivatives(self._dv[own], np.zeros((n, dload.shape[1]), dtype=complex))
+            self.rest.append(rest)
+            self._dx.append(dx)
+            self._dset.append(dscale[seen : seen + n, None, :])
+            seen += n
+
+    def _power_flow(self, rule: str, reactive_limits: bool) -> list[Equilibrium]:
+        """Solve it with the power that the facilities draw at rest at the voltages that it gives."""
+        system, load = self.system, self._load
+        at = system.unit_bus[sum(len(g.units) for g in system.groups) :]
+        v = np.ones(len(load), dtype=complex)
+        drawn = np.zeros(len(at), dtype=complex)
+        for _ in range(ROUNDS):
+            fed, first = [], 0
+            for group in system.facilities:
+                own = at[first : first + len(group.units)]
+                first += len(group.units)
+                fed.append(group.equilibrium(v[own], np.zeros(len(own), dtype=complex), self.where))
+            before = drawn
+            drawn = np.concatenate([*(-v[g] * f.current.conj() for g, f in self._at(fed, at)), np.zeros(0)])
+            total = load.copy()
+            np.add.at(total, at, drawn)
+            if len(at) and np.abs(drawn - before).max() < AGREED:
+                return fed
+            self.steady = system.flow.solve(total, rule, reactive_limits, self.where)
+            v = self.steady.v
+            if not len(at):
+                return fed
+        raise SimulationError(
+            f"{self.where}: the power that the facilities draw and the voltages of the power flow did not agree in "
+            f"{ROUNDS} rounds. Way out: host less."
+        )
+
+    @staticmethod
+    def _at(fed: Sequence[Equilibrium], at: Integers) -> list[tuple[Integers, Equilibrium]]:
+        ends = np.cumsum([0, *(len(rest.group.units) for rest in fed)])
+        return [(at[a:b], rest) for a, b, rest in zip(ends, ends[1:], fed, strict=False)]
+
+    def _derivatives(self, fed: Sequence[Equilibrium], dscale: Floats) -> None:
+        """Derivatives of voltages and generation. What the facilities draw follows the voltage: a fixed point."""
+        d = self._dload.shape[1]
+        self._dv = self._dgeneration = np.zeros((len(self.v0), d), dtype=complex)
+        if not d:
+            return
+        at = self.system.unit_bus[sum(len(g.units) for g in self.system.groups) :]
+        scale = np.concatenate([*(r.p[:, r.group.structure.column(SCALE)] for r in fed), np.zeros(0)])
+        for _ in range(ROUNDS):
+            dload, before = self._dload.copy(), self._dv
+            first = 0
+            for own, rest in self._at(fed, at):
+                v, dv, i = self.v0[own, None], before[own], rest.current[:, None]
+                per_scale = np.divide(1.0, scale[first : first + len(own)])[:, None]
+                di = rest.current_by_v(dv) + i * per_scale * dscale[first : first + len(own)]
+                np.add.at(dload, own, -(dv * i.conj() + v * di.conj()))
+                first += len(own)
+            self._dv, self._dgeneration = self.steady.derivatives(dload)
+            if np.abs(self._dv - before).max() <= 1e-12 * np.abs(self._dv).max():
+                return
+        raise SimulationError(f"{self.where}: derivatives of the power flow did not settle. Way out: host less.")
 
     def _currents(self, group: Group, at: Integers) -> tuple[Phasors, Phasors]:
         """Current of each unit into the network, from its part of the generation at its bus."""
@@ -156,8 +231,8 @@ class NativePoint:
     @cached_property
     def _diagonal(self) -> Phasors:
         """Loads at their voltage before the fault, and what the network holds for the units."""
-        y = self.steady.load.conj() / abs(self.v0) ** 2
-        shunts = np.concatenate([*(g.shunts() for g in self.system.groups), np.zeros(0)])
+        y = self._load.conj() / abs(self.v0) ** 2
+        shunts = np.concatenate([*(g.shunts() for g in self.system.all_groups), np.zeros(0)])
         np.add.at(y, self.system.unit_bus, shunts)
         return y
 
@@ -168,7 +243,7 @@ class NativePoint:
             return None
         size = abs(self.v0)[:, None]
         d_size = (self.v0.conj()[:, None] * self._dv).real / size
-        load = self.steady.load[:, None]
+        load = self._load[:, None]
         return self._dload.conj() / size**2 - 2.0 * load.conj() / size**3 * d_size
 
     def _ports(self, out: frozenset[int]) -> Ports:

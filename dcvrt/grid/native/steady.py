@@ -207,7 +207,7 @@ class Flow:
         """
         network, where = self.network, where or self.network.name
         kind = np.array(network.kind)
-        q_fixed, v = np.zeros(len(kind)), network.v_set.astype(complex)
+        q_fixed, v = np.zeros(len(kind)), network.v_set * np.exp(1j * network.slack_angle)
         found = self._newton(load, kind, q_fixed, rule, v, where)
         if reactive_limits:
             found = self._with_limits(load, kind, q_fixed, rule, found, where)

@@ -14,6 +14,9 @@ from dcvrt.errors import ModelError, did_you_mean
 from dcvrt.integrators.kernel.emit import Argument, Program
 
 
+SCALE = "scale"
+
+
 @dataclass(frozen=True, eq=False)
 class Structure:
     r"""What units of one structure share: their equations, as the network sees them.
@@ -34,7 +37,8 @@ class Structure:
     sign : float
         1 where the output flows into the network, -1 where it flows into the unit.
     moving : sequence of str
-        Parameters that change with the operating point: derivatives pass through them.
+        Parameters that change with the operating point: derivatives pass through them. `SCALE` is the factor from
+        the unit's base to that of the system.
     angle : str
         State that is the angle of a rotor; empty where there is none.
     """
@@ -83,7 +87,12 @@ class Structure:
     def i(self) -> ca.SX:
         """Current into the network: real and imaginary part."""
         names = self.dae.y_names
-        return self.sign * ca.vertcat(*(self.dae.y[names.index(n)] for n in self._parts(self.current)))
+        return self.sign * self.scale * ca.vertcat(*(self.dae.y[names.index(n)] for n in self._parts(self.current)))
+
+    @cached_property
+    def scale(self) -> ca.SX:
+        """Base of the unit over that of the system."""
+        return ca.SX.sym(SCALE)
 
     @cached_property
     def y(self) -> ca.SX:
@@ -106,7 +115,7 @@ class Structure:
         if ca.depends_on(self.slope, ca.vertcat(dae.x, dae.u, dae.q, dae.clocks, dae.t)):
             return False
         values = [row.value for row in dae.parameter_rows]
-        a = np.array(ca.Function("slope", [dae.p], [ca.densify(self.slope)])(values))
+        a = np.array(ca.Function("slope", [dae.p, self.scale], [ca.densify(self.slope)])(values, 1.0))
         return bool(np.allclose([a[0, 0], a[0, 1]], [a[1, 1], -a[1, 0]], rtol=1e-12, atol=1e-12))
 
     @cached_property
@@ -119,10 +128,14 @@ class Structure:
 
     @cached_property
     def p(self) -> ca.SX:
-        """Parameters, then inputs that rest, then the shunt."""
+        """Parameters, then inputs that rest, then the scale and the shunt."""
         names = self.dae.u_names
         rest = [self.dae.u[names.index(n)] for n in self.others]
-        return ca.vertcat(self.dae.p, *rest, self.y)
+        return ca.vertcat(self.dae.p, *rest, self.scale, self.y)
+
+    def column(self, path: str) -> int:
+        """Position among `p` of a parameter, or of `SCALE`."""
+        return self.p.numel() - 3 if path == SCALE else self.dae.parameter_number(path)
 
     @cached_property
     def rows(self) -> list[tuple[int, object]]:
@@ -156,15 +169,15 @@ class Structure:
         inputs = ca.vertcat(self.v, dae.clocks)
         sizes = {"xs": dae.x.numel(), "us": inputs.numel(), "sp": len(self.moving)}
         xs, us, sp = (ca.SX.sym(name, n) for name, n in sizes.items())
-        seeds = ca.SX.zeros(dae.p.numel())
+        seeds = ca.SX.zeros(self.p.numel())
         for k, path in enumerate(self.moving):
-            seeds[dae.parameter_number(path)] = sp[k]
+            seeds[self.column(path)] = sp[k]
 
         def along(expression: ca.SX) -> ca.SX:
             return ca.densify(
                 ca.jtimes(
                     expression,
-                    ca.vertcat(dae.x, inputs, dae.p),
+                    ca.vertcat(dae.x, inputs, self.p),
                     ca.vertcat(xs, us, seeds),
                 )
             )
