@@ -17,7 +17,7 @@ MODELS = BASE | {"dae", "units", "models"}
 INTEGRATORS = BASE | {"dae", "linear", "waveform", "trajectory", "integrators"}
 FUNCTIONALS = {"curve", "functionals"}
 CRITERIA = INTEGRATORS | FUNCTIONALS | {"criteria"}
-GRID = BASE | {"units", "waveform", "dae", "grid", "integrators", "trajectory"}
+GRID = MODELS | {"waveform", "grid", "integrators", "trajectory"}  # models: the blocks of machines
 PLANNING = GRID | CRITERIA | MODELS | {"facility", "planning"}
 ALLOWED = {
     "errors": BASE,

@@ -82,7 +82,7 @@ def eliminated(dae: Dae, wanted: bool | Sequence[str], strict: bool = True) -> D
     equation_of = {variable: equation for equation, variable in matching(structure(dae.g, dae.z)).items()}
     gone = [k for k, path in enumerate(paths) if path in chosen]
     used = [equation_of[k] for k in gone]
-    z, g = dae.z[gone], dae.g[used]
+    z, g = _picked(dae.z, gone), _picked(dae.g, used)
     solution, stuck = _solve(g, z)
     if stuck and not strict:
         return eliminated(dae, [paths[k] for j, k in enumerate(gone) if j not in stuck], strict=False)
@@ -103,7 +103,7 @@ def eliminated(dae: Dae, wanted: bool | Sequence[str], strict: bool = True) -> D
 
     left = [k for k in range(len(paths)) if k not in gone]
     rest = [k for k in range(len(paths)) if k not in used]
-    together = ca.cse(put(ca.vertcat(dae.f, dae.g[rest], dae.y))[0])
+    together = ca.cse(put(ca.vertcat(dae.f, _picked(dae.g, rest), dae.y))[0])
     nx, nz = dae.x.numel(), len(left)
     automata = tuple(
         replace(
@@ -117,7 +117,7 @@ def eliminated(dae: Dae, wanted: bool | Sequence[str], strict: bool = True) -> D
     )
     return replace(
         dae,
-        z=dae.z[left],
+        z=_picked(dae.z, left),
         g=together[nx : nx + nz],
         f=together[:nx],
         y=together[nx + nz :],
@@ -125,6 +125,11 @@ def eliminated(dae: Dae, wanted: bool | Sequence[str], strict: bool = True) -> D
         automata=automata,
         start=put(dae.start[[*range(nx), *(nx + k for k in left)]])[0],
     )
+
+
+def _picked(column: ca.SX, places: Sequence[int]) -> ca.SX:
+    """Entries of a column as a column. CasADi gives a row for none of one, which `vertcat` makes an entry."""
+    return ca.vertcat(ca.SX(0, 1), *[column[k] for k in places])
 
 
 def _solve(g: ca.SX, z: ca.SX) -> tuple[ca.SX, list[int]]:

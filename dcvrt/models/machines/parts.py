@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from math import sqrt
 from typing import Any, ClassVar
 
@@ -9,7 +11,7 @@ import casadi as ca
 
 from dcvrt.errors import InputError, raise_all
 from dcvrt.models.automaton import Go, above, below
-from dcvrt.models.block import Block
+from dcvrt.models.block import SHORTEST, Block
 from dcvrt.models.declared import State
 from dcvrt.models.phasor import Phasor, Scalar
 
@@ -48,9 +50,10 @@ class UnitBlock(Block):
         value = self.values[parameter]
         if parameter in self.switches:
             return value, value
-        if parameter in self.optional and value == 0:
-            return 0.0, 0.0
-        return super().settable(parameter)
+        low, high = super().settable(parameter)
+        if parameter in self.optional:
+            return (0.0, 0.0) if value == 0 else (max(low, min(value, SHORTEST)) if low == 0 else low, high)
+        return low, high
 
     def traits(self) -> tuple[Any, ...]:
         """What decides the equations beside zeros and switches."""
@@ -105,6 +108,11 @@ def lag_rows(
     return clip_rows(target, low, high) if at_once else windup_rows(state, x, target, low, high)
 
 
+def lag_value(s: Any, x: Scalar, low: Scalar, high: Scalar, at_once: bool) -> Scalar:
+    """What a lag gives whose limits move: its state, or the limit as it is now."""
+    return x if at_once else limited(s, x, low, high)
+
+
 def clip_rows(signal: Scalar, low: Scalar, high: Scalar) -> tuple[Go, ...]:
     """Rows of a signal without memory that is cut off at two limits."""
     return (
@@ -128,6 +136,41 @@ def windup_rows(state: str, x: Scalar, target: Scalar, low: Scalar, high: Scalar
         Go("UPPER", "FREE", below(target - high, 0.0), reset={state: high}),
         Go("LOWER", "FREE", above(target - low, 0.0), reset={state: low}),
     )
+
+
+def product(first: Sequence[Go], second: Sequence[Go], of_first: Sequence[str] = LIMITED) -> tuple[Go, ...]:
+    """Rows of two limiters that stand in one block; its modes are pairs, `PAIRS` where both have three."""
+    rows = [
+        replace(row, source=f"{row.source}_{other}", target=f"{row.target}_{other}")
+        for other in LIMITED
+        for row in first
+    ]
+    rows += [
+        replace(row, source=f"{other}_{row.source}", target=f"{other}_{row.target}")
+        for other in of_first
+        for row in second
+    ]
+    return tuple(rows)
+
+
+PAIRS = tuple(f"{one}_{other}" for one in LIMITED for other in LIMITED)
+
+
+def pair_flags(first: str, second: str) -> dict[str, tuple[int, ...]]:
+    """Flags of two limiters in one block: those of the first with one prefix, of the second with another."""
+    n = len(LIMITED)
+    return {
+        f"{first}{name}": tuple(flag for flag in c for _ in range(n)) for name, c in LIMIT_FLAGS.items()
+    } | {f"{second}{name}": c * n for name, c in LIMIT_FLAGS.items()}
+
+
+class Flags:
+    """The flags of one of two limiters in a block, as if it were alone."""
+
+    def __init__(self, s: Any, prefix: str) -> None:
+        self.free = getattr(s, f"{prefix}free")
+        self.upper = getattr(s, f"{prefix}upper")
+        self.lower = getattr(s, f"{prefix}lower")
 
 
 # -- saturation --------------------------------------------------------------------------------------------

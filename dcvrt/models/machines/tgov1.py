@@ -73,3 +73,19 @@ class Tgov1(UnitBlock):
 
     def rest(self, s: Any) -> dict[str, Any]:
         return dict(g=s.p_ref, x=s.p_ref)
+
+
+class Tgov1N(Tgov1):
+    r"""TGOV1 whose set-point is added after the droop, TGOV1N.
+
+    .. math::
+        P_d = P_{ref} - \frac{\omega - 1}{R}, \qquad T_1 \dot g = P_d - g, \qquad V_{min} \le g \le V_{max}
+
+    .. math::
+        T_3 \dot x = g - x, \qquad T_m = x + \frac{T_2}{T_3} (g - x) - D_t (\omega - 1)
+
+    The equations are those of TGOV1, whose set-point is given in power here as well; the two differ in how a
+    change of dispatch is told to them, which no fault simulation does.
+    Valid as TGOV1. Equilibrium: omega = 1, g = x = T_m = P_ref.
+    Source: ANDES's TGOV1N.
+    """

@@ -10,16 +10,21 @@ from dcvrt.models.block import Block
 from dcvrt.models.declared import Input, Part, Port
 from dcvrt.models.diagram import Diagram
 from dcvrt.models.machines.fixed import FixedField, FixedPower, NoStabiliser
+from dcvrt.models.machines.frequency import BusFrequency
 from dcvrt.models.machines.parts import UnitBlock
 from dcvrt.models.netlist import netlist
 from dcvrt.models.phasor import Phasor
 
-FIELD = ("exciter.v_ref", "exciter.v_f0")
+FIELD = ("exciter.v_ref", "exciter.regulator.v_ref", "exciter.v_f0")
 POWER = ("governor.p_ref",)
 
 
 def unit(
-    machine: Block, exciter: Part | None = None, governor: Part | None = None, stabiliser: Part | None = None
+    machine: Block,
+    exciter: Part | None = None,
+    governor: Part | None = None,
+    stabiliser: Part | None = None,
+    frequency: Part | None = None,
 ) -> Diagram:
     """Wire a unit. All its quantities are per unit on one common power base.
 
@@ -29,6 +34,8 @@ def unit(
     exciter : without one the field voltage is constant, `FixedField`.
     governor : without one the torque is constant, `FixedPower`.
     stabiliser : may be left out; needs an exciter.
+    frequency : meter for a stabiliser that reads the frequency of the terminal; `BusFrequency()` by default,
+        left out where nothing reads it.
 
     Returns
     -------
@@ -62,6 +69,10 @@ def unit(
     sources["v_f"] = parts["exciter"].v_f
     sources["t_m"], sources["p_set"] = parts["governor"].t_m, parts["governor"].p_set
     sources["v_s"] = parts["stabiliser"].v_s
+    sources["f"] = sources["omega"]  # no stabiliser reads it that does not ask for the meter
+    if getattr(stabiliser, "needs_frequency", False):
+        parts["frequency"] = d.add("frequency", frequency if frequency is not None else BusFrequency())
+        sources["f"] = parts["frequency"].f
     for part in parts.values():
         for name in part.declared(Input):
             if name not in sources:
