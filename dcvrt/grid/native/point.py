@@ -310,6 +310,7 @@ class NativePoint:
             found.events,
             found.steps,
             found.rejected,
+            found.end,
         )
 
 

@@ -284,6 +284,8 @@ class Simulated:
         Empty when the end was reached.
     events : tuple of (time, unit, row)
     steps, rejected : int
+    end : array
+        States where the run ended, as they lie in lanes.
     """
 
     v: Phasors
@@ -292,6 +294,7 @@ class Simulated:
     events: tuple[tuple[float, str, str], ...]
     steps: int
     rejected: int
+    end: Floats
 
 
 def simulate(
@@ -347,6 +350,7 @@ def simulate(
         tuple(e for e in named if e[1]),
         record.steps,
         record.rejected,
+        x,
     )
 
 
