@@ -147,7 +147,9 @@ def gfl_vfd_cooling() -> Diagram:
     f.connect(drive.energy, ledger.drive_energy)
     f.connect(drive.loss, ledger.drive_loss)
 
-    _name_outputs(f, p_g=site.p, q_g=site.q, i_g=site.i_mag, i=site.drawn, i_max=site.i_max, p_out=load.served)
+    _name_outputs(
+        f, p_g=site.p, q_g=site.q, i_g=site.i_mag, i=site.drawn, i_max=site.i_max, p_out=load.served
+    )
     f.output("p_ups", f.port("poi.p"))
     f.output("i_ups", f.port("poi.i_mag"))
     f.output("w_drive", drive.w)

@@ -23,8 +23,8 @@ import numpy.typing as npt
 
 from dcvrt.cache import cache_folder
 from dcvrt.errors import InputError, SimulationError
-from dcvrt.grid.dynamics118 import Machine
 from dcvrt.grid import units
+from dcvrt.grid.dynamics118 import Machine
 from dcvrt.grid.network import Branches, Generators, Network
 from dcvrt.grid.units import Unit
 
@@ -32,7 +32,8 @@ Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
 NO_MACHINES = (
-    "{where}: the case has no dynamic data, not one machine. Way out: add a machine (GENROU, GENCLS) for each "
+    "{where}: the case has no dynamic data, not one machine. Way out: add a machine (GENROU, GENCLS) "
+    "for each "
     "generator, in a .dyr file given as dynamics=... or in the case itself."
 )
 
@@ -304,7 +305,9 @@ def read_units(path: Path, dynamics: Path | None, machines: Sequence[Machine], n
         system.setup()
     lacking = units.unsupported(system)
     if lacking:
-        lines = [f"{model}: {count} device(s): {', '.join(map(str, names))}" for model, count, names in lacking]
+        lines = [
+            f"{model}: {count} device(s): {', '.join(map(str, names))}" for model, count, names in lacking
+        ]
         raise InputError(
             f"{name}: the native engine lacks {len(lines)} dynamic model(s) of this case.\n  "
             + "\n  ".join(lines)

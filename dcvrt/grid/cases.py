@@ -105,5 +105,7 @@ def _from_tables(case: matpower.Case, name: str) -> Network:
             q_max=unit[:, matpower.GEN_Q_MAX].copy(),
             name=tuple(names),
         ),
-        slack_angle=float(np.deg2rad(bus[bus[:, matpower.BUS_TYPE] == matpower.SLACK, matpower.BUS_ANGLE].sum())),
+        slack_angle=float(
+            np.deg2rad(bus[bus[:, matpower.BUS_TYPE] == matpower.SLACK, matpower.BUS_ANGLE].sum())
+        ),
     )

@@ -182,8 +182,8 @@ class FaultSequence:
     Parameters
     ----------
     events : tuple of BusFault or LineTrip
-        In the order of time, none starting before the one before it is cleared. A line that is opened for good
-        stays open.
+        In the order of time, none starting before the one before it is cleared. A line that is opened for
+        good stays open.
 
     Raises
     ------
@@ -203,7 +203,8 @@ class FaultSequence:
         if not self.events:
             raise InputError("a sequence needs at least one fault.")
         problems = [
-            f"{later.label} starts at {later.start:g} s, before {earlier.label} ends at {earlier.cleared_at:g} s."
+            f"{later.label} starts at {later.start:g} s, before {earlier.label} ends at "
+            f"{earlier.cleared_at:g} s."
             for earlier, later in zip(self.events, self.events[1:], strict=False)
             if later.start <= earlier.cleared_at
         ]
@@ -255,7 +256,9 @@ def branch(network: Network, from_bus: int, to_bus: int) -> int:
     for k in range(len(lines)):
         if {int(lines.from_bus[k]), int(lines.to_bus[k])} == ends:
             return k
-    near = [lines.label(k) for k in range(len(lines)) if ends & {int(lines.from_bus[k]), int(lines.to_bus[k])}]
+    near = [
+        lines.label(k) for k in range(len(lines)) if ends & {int(lines.from_bus[k]), int(lines.to_bus[k])}
+    ]
     raise InputError(
         f"{network.name}: no branch joins buses {from_bus} and {to_bus}. Those at either end: "
         f"{', '.join(near) or 'none; check the bus numbers'}."

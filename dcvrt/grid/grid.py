@@ -25,7 +25,8 @@ Phasors = npt.NDArray[np.complex128]
 
 ENGINES = ("native", "andes")
 STEP = 1.0 / 120.0
-"""Default sample distance, s, and the step of ANDES: its complex voltages are 2e-4 pu off in a fault and 4e-4 pu
+"""Default sample distance, s, and the step of ANDES: its complex voltages are 2e-4 pu off in a fault and
+4e-4 pu
 after, against 1/1920 s; twice the step takes half the time and has four times the error. The native engine
 chooses its own steps."""
 
@@ -193,9 +194,10 @@ class Grid:
             `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
             cleared, s.
         facilities : mapping of site to Diagram, optional
-            Facilities that act back on the network, with `native`; what is hosted at other sites is a constant
-            impedance in the fault. Each has the site's capacity, the period's load factor and the grid's power
-            factor; its own `beta`.
+            Facilities that act back on the network, with `native`; what is hosted at other sites is a
+            constant
+            impedance in the fault. Each has the site's capacity, the period's load factor and the grid's
+            power factor; its own `beta`.
 
         Returns
         -------
@@ -403,7 +405,8 @@ class Grid:
                 problems += [f"fault: {line}" for line in self._unknown([event.bus])]
                 if event.bus in self.sites:
                     problems.append(
-                        f"fault at bus {event.bus}: it is a candidate site, and no site rides through a fault at "
+                        f"fault at bus {event.bus}: it is a candidate site, and no site rides through "
+                        "a fault at "
                         "its own bus. Way out: a fault at a neighbouring bus."
                     )
             if until <= fault.cleared_at:

@@ -201,7 +201,9 @@ class Network:
 
     def admittance_without(self, out: Collection[int]) -> sp.csr_matrix:
         """Y with the branches at these positions open."""
-        return self._admittance_of(np.setdiff1d(np.arange(len(self.branches)), np.array(list(out), dtype=int)))
+        return self._admittance_of(
+            np.setdiff1d(np.arange(len(self.branches)), np.array(list(out), dtype=int))
+        )
 
     @cached_property
     def _admittance(self) -> sp.csr_matrix:

@@ -1,19 +1,30 @@
-"""Objects of the native engine: one for each structure of unit, one for the network; compiled once and kept."""
+"""Objects of the native engine: one for each structure of unit, one for the network, compiled once."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import POINTER, Structure, c_double, c_long, c_void_p
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 from dcvrt.errors import InputError
-from dcvrt.grid.native.text import Structure as UnitStructure
+from dcvrt.grid.native.structure import Structure as UnitStructure
+from dcvrt.grid.native.text import text_of
 from dcvrt.integrators.compiler import Compiler, build, find_compiler, native_flags
 
-FLAGS = ("-std=gnu11", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
+FLAGS = (
+    "-std=gnu11",
+    "-O3",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=fast",
+    "-fPIC",
+    "-shared",
+)
 QUIET = ("-Wno-psabi", "-w")
 DOUBLES, LONGS = POINTER(c_double), POINTER(c_long)
 
@@ -25,12 +36,13 @@ class GroupStruct(Structure):
         *(
             (name, c_long)
             for name in (
-                "packs", "nx", "np", "nq", "na", "rows", "bounds", "moving", "fixed", "fixed_columns", "ports",
-                "v_rows", "first_port", "first_state", "reads_v", "angle",
+                "packs", "nx", "np", "nq", "na", "rows", "bounds", "moving", "fixed",
+                "fixed_columns",
+                "ports", "v_rows", "first_port", "first_state", "reads_v", "angle",
             )
         ),
-        *((name, DOUBLES) for name in ("p", "moving_seed", "held", "inertia", "q", "entry", "entries", "since")),
-        ("sinces", DOUBLES), ("along", c_long),
+        *((name, DOUBLES) for name in ("p", "moving_seed", "held", "inertia")),
+        *((name, DOUBLES) for name in ("q", "entry", "entries", "since", "sinces")), ("along", c_long),
         *((name, DOUBLES) for name in ("kept", "kept_columns", "no_columns")),
         *(
             (name, LONGS)
@@ -128,18 +140,24 @@ def network_library() -> ctypes.CDLL:
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
     dll.fleet_run.argtypes = [
-        POINTER(FleetStruct), POINTER(OptionsStruct), c_long, POINTER(StretchStruct), DOUBLES, DOUBLES, DOUBLES,
-        POINTER(RecordStruct),
+        POINTER(FleetStruct), POINTER(OptionsStruct), c_long, POINTER(StretchStruct), DOUBLES, DOUBLES,
+        DOUBLES, POINTER(RecordStruct),
     ]  # fmt: skip
     return dll
 
 
-def unit_objects(structures: list[UnitStructure]) -> list[UnitObject]:
-    """Objects of several structures, compiled side by side where they are not there yet."""
-    found = compiler()
-    flags = (*FLAGS, *native_flags(found), *QUIET)
-    fixed = _files("fleet.h", "group.c", "lanes.h", "width.h")
-    texts = [{**fixed, "unit.h": structure.text()} for structure in structures]
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        paths = list(pool.map(lambda files: build(files, found, flags, ("group.c",)), texts))
-    return [UnitObject(path) for path in paths]
+_objects: WeakKeyDictionary[UnitStructure, UnitObject] = WeakKeyDictionary()
+
+
+def unit_objects(structures: Sequence[UnitStructure]) -> list[UnitObject]:
+    """Objects of several structures; those that are not there yet are compiled side by side."""
+    new = [s for s in structures if s not in _objects]
+    if new:
+        found = compiler()
+        flags = (*FLAGS, *native_flags(found), *QUIET)
+        fixed = _files("fleet.h", "group.c", "lanes.h", "width.h")
+        texts = [{**fixed, "unit.h": text_of(structure)} for structure in new]
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            paths = list(pool.map(lambda files: build(files, found, flags, ("group.c",)), texts))
+        _objects.update(zip(new, map(UnitObject, paths), strict=True))
+    return [_objects[s] for s in structures]

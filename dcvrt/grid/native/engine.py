@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import InputError, raise_all
+from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
 from dcvrt.grid.native.point import NativePoint, System, refuse_islands
 from dcvrt.grid.native.run import Options, Simulated
 from dcvrt.grid.native.steady import directions, loads
-from dcvrt.grid.native.text import SCALE, Structure
+from dcvrt.grid.native.structure import SCALE, Structure
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
 from dcvrt.models import Diagram
@@ -27,20 +28,6 @@ Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
 QUANTITY = re.compile(r"(?:(?P<kind>H|wind)_(?P<bus>\d+)|(?P<whole>load|clear))")
-
-
-class Described(Protocol):
-    """A generating unit as a case describes it."""
-
-    name: str
-    bus: int
-    share_p: float
-    share_q: float
-    structure: Any
-    values: Mapping[str, float]
-
-    def diagram(self) -> Any:
-        """The unit wired from blocks, with its values."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +61,8 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
         match = QUANTITY.fullmatch(name)
         if match is None:
             problems.append(
-                f"wrt: {name!r} is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every "
+                f"wrt: {name!r} is not known. It takes H (all sites), H_<bus>, wind_<bus>, load "
+                "(factor on every "
                 "load) and clear (s)."
             )
             continue
@@ -88,20 +76,19 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
     return tuple(found)
 
 
-def groups(units: Iterable[Described]) -> tuple[Group, ...]:
+def groups(units: Iterable[described.Unit]) -> tuple[Group, ...]:
     """Units in groups of one structure, each compiled once."""
-    by_structure: dict[Any, list[Described]] = {}
+    by_structure: dict[Any, list[described.Unit]] = {}
     for unit in units:
         by_structure.setdefault(unit.structure, []).append(unit)
     made = []
     for same in by_structure.values():
         dae = same[0].diagram().compile()
-        follow = setpoints(dae)
-        angle = "machine.delta"
-        structure = Structure(dae, moving=follow, angle=angle if angle in dae.x_names else "")
-        members = [Unit(u.name, u.bus, u.values, u.share_p, u.share_q) for u in same]
         behind = next(path for path in ("machine.x_q", "machine.x_d1") if path in dae.p_names)
-        made.append(Group(structure, members, follow, "machine.M", behind))
+        structure = Structure(
+            dae, setpoints=setpoints(dae), angle="machine.delta", inertia="machine.M", reactance=behind
+        )
+        made.append(Group(structure, [Unit(u.name, u.bus, u.values, u.share_p, u.share_q) for u in same]))
     return tuple(made)
 
 
@@ -112,7 +99,7 @@ class Engine:
     Parameters
     ----------
     network : Network
-    units : sequence of Described
+    units : sequence of dcvrt.grid.units.Unit
     sites : sequence of int
     per_hosted : complex
         MVA that a hosted MW takes.
@@ -123,12 +110,12 @@ class Engine:
     """
 
     network: Network
-    units: tuple[Described, ...]
+    units: tuple[described.Unit, ...]
     sites: tuple[int, ...]
     per_hosted: complex
     rule: str = "proportional"
     reactive_limits: bool = False
-    options: Options = Options()
+    options: Options = field(default_factory=Options)
 
     @cached_property
     def system(self) -> System:
@@ -154,20 +141,22 @@ class Engine:
         scale = period.dc_factor * self.per_hosted
         hosted = {bus: 0j if bus in own else scale * hosting.get(bus, 0.0) for bus in self.sites}
         load = loads(network, hosted, period.wind, period.load_scale)
-        network_load = (network.p_load + 1j * network.q_load) / network.base_mva
+        network_load = loads(network, {}, {}, 1.0)
         outside = [("", None) if q.kind == "H" and q.bus in own else (q.kind, q.bus) for q in wrt]
         changes = directions(network, outside, scale, network_load)
         sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
         for row, unit in enumerate(unit for group in coupled for unit in group.units):
             sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
-        system = self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
+        system = (
+            self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
+        )
         where = f"{network.name}, {period.name}"
         return NativePoint(system, load, changes, sizes, self.rule, self.reactive_limits, where)
 
     def _coupled(
         self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram]
     ) -> tuple[Group, ...]:
-        """Facilities as units of the grid, those of one diagram together; a site that hosts nothing has none."""
+        """Facilities as units, those of one diagram together; a site that hosts nothing has none."""
         by_diagram: dict[int, list[int]] = {}
         for bus, diagram in facilities.items():
             if hosting.get(bus, 0.0) > 0:
@@ -178,7 +167,7 @@ class Engine:
         for buses in by_diagram.values():
             diagram = facilities[buses[0]]
             if diagram not in self._structures:
-                self._structures[diagram] = Structure(diagram.compile(), "v_poi", "i", -1.0, (SCALE,))
+                self._structures[diagram] = Structure(diagram.compile(), "v_poi", "i", -1.0, sized=True)
             structure = self._structures[diagram]
             known = {path: value for path, value in given.items() if path in structure.dae.p_names}
             structure.dae.parameter_values(**known)

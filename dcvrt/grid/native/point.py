@@ -1,4 +1,4 @@
-"""An operating point of the native engine: power flow, equilibrium of all units, fault after fault from there."""
+"""An operating point of the native engine: power flow, equilibrium, fault after fault from there."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from dcvrt.grid.native import ports as network_ports
 from dcvrt.grid.native.build import unit_objects
 from dcvrt.grid.native.fleet import Equilibrium, Group
 from dcvrt.grid.native.ports import Ports
-from dcvrt.grid.native.steady import Flow
-from dcvrt.grid.native.text import SCALE
 from dcvrt.grid.native.run import Fleet, Layout, NetworkTable, Options, Simulated, simulate
+from dcvrt.grid.native.steady import Flow
+from dcvrt.grid.native.structure import SCALE
 from dcvrt.grid.network import Network
 
 Floats = npt.NDArray[np.float64]
@@ -170,7 +170,8 @@ class NativePoint:
             if not len(at):
                 return fed
         raise SimulationError(
-            f"{self.where}: the power that the facilities draw and the voltages of the power flow did not agree in "
+            f"{self.where}: the power that the facilities draw and the voltages of the power flow did "
+            "not agree in "
             f"{ROUNDS} rounds. Way out: host less."
         )
 
@@ -180,7 +181,7 @@ class NativePoint:
         return [(at[a:b], rest) for a, b, rest in zip(ends, ends[1:], fed, strict=False)]
 
     def _derivatives(self, fed: Sequence[Equilibrium], dscale: Floats) -> None:
-        """Derivatives of voltages and generation. What the facilities draw follows the voltage: a fixed point."""
+        """Derivatives of voltages and generation; what facilities draw follows the voltage."""
         d = self._dload.shape[1]
         self._dv = self._dgeneration = np.zeros((len(self.v0), d), dtype=complex)
         if not d:
@@ -199,7 +200,9 @@ class NativePoint:
             self._dv, self._dgeneration = self.steady.derivatives(dload)
             if np.abs(self._dv - before).max() <= 1e-12 * np.abs(self._dv).max():
                 return
-        raise SimulationError(f"{self.where}: derivatives of the power flow did not settle. Way out: host less.")
+        raise SimulationError(
+            f"{self.where}: derivatives of the power flow did not settle. Way out: host less."
+        )
 
     def _currents(self, group: Group, at: Integers) -> tuple[Phasors, Phasors]:
         """Current of each unit into the network, from its part of the generation at its bus."""
@@ -296,7 +299,9 @@ class NativePoint:
                 continue
             unchanged = not stage.shunts and not stage.out
             network = self._before if unchanged else self._network(stage)
-            pieces.append((float(samples[0]), float(samples[-1]), network, samples, (moves or {}).get(k, still)))
+            pieces.append(
+                (float(samples[0]), float(samples[-1]), network, samples, (moves or {}).get(k, still))
+            )
         unit, _ = self.system.layout.unit_of_port()
         v_start = self.v0[self.system.unit_bus[unit]]
         found = simulate(self.fleet, pieces, v_start, options)
@@ -330,5 +335,6 @@ def refuse_islands(network: Network, stages: Sequence[Stage], where: str) -> Non
             lines = ", ".join(network.branches.label(k) for k in sorted(stage.out))
             shown = ", ".join(map(str, cut[:8])) + (", ..." if len(cut) > 8 else "")
             raise SimulationError(
-                f"{where}: with {lines} open, {len(cut)} bus(es) are islanded: {shown}. Islands are not simulated."
+                f"{where}: with {lines} open, {len(cut)} bus(es) are islanded: {shown}. Islands are "
+                "not simulated."
             )

@@ -1,4 +1,5 @@
-r"""The network as its ports see it: impedances of a factored admittance matrix, faults as updates of rank one.
+r"""The network as its ports see it: impedances of a factored admittance matrix, faults as updates of rank
+one.
 
 With the units as source currents s at their ports, and all that is linear in the admittance matrix,
 
@@ -45,17 +46,21 @@ class Ports:
     def _factors(self) -> spla.SuperLU:
         return spla.splu(self.y)
 
+    @cached_property
+    def _transposed(self) -> spla.SuperLU:
+        return spla.splu(self.y.T.tocsc())
+
     def columns(self, buses: Integers) -> Phasors:
         """Columns of Z (buses of the network, buses asked for)."""
         right = np.zeros((self.y.shape[0], len(buses)), dtype=complex)
         right[buses, np.arange(len(buses))] = 1.0
-        return self._factors.solve(right)
+        return np.asarray(self._factors.solve(right), dtype=complex)
 
     def rows(self, buses: Integers) -> Phasors:
         """Rows of Z (buses asked for, buses of the network)."""
         right = np.zeros((self.y.shape[0], len(buses)), dtype=complex)
         right[buses, np.arange(len(buses))] = 1.0
-        return self._factors.solve(right, "T").T
+        return np.asarray(self._transposed.solve(right), dtype=complex).T
 
     @cached_property
     def from_ports(self) -> Phasors:

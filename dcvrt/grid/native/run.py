@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Sequence
 from ctypes import POINTER, byref, c_long, pointer
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -90,7 +91,7 @@ class Layout:
         return -(-sum(self.packs) * self.lanes // BLOCK) * BLOCK
 
     def unit_of_port(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-        """For each port the number of its unit, counted through the groups, and whether it is not a repeat."""
+        """Of each port the number of its unit, through the groups, and whether it is not a repeat."""
         unit, real, first = [], [], 0
         for group, packs in zip(self.groups, self.packs, strict=True):
             n = len(group.units)
@@ -203,9 +204,11 @@ class Fleet:
         flags = [np.asarray(a.flags, dtype=float).reshape(len(a.modes), -1) for a in automata]
         widths = [f.shape[1] for f in flags]
         begins = np.cumsum([0, *(f.size for f in flags)])[:-1]
-        start = np.concatenate([*(f[a.mode_number(a.start)] for a, f in zip(automata, flags, strict=True)), []])
+        start = np.concatenate(
+            [*(f[a.mode_number(a.start)] for a, f in zip(automata, flags, strict=True)), []]
+        )
         held = group.held(eq.p)
-        moving = len(group.structure.moving)
+        modes = np.array([a.mode_number(a.start) for a in automata] or [0])
         seeds = dset.transpose(0, 2, 1)
         structure = group.structure
 
@@ -215,24 +218,26 @@ class Fleet:
         def longs(values: Sequence[int]) -> object:
             return self._held(np.array([*values, 0], dtype=c_long)).ctypes.data_as(LONGS)
 
-        def varying(array: npt.NDArray[np.generic], kind: object) -> object:
+        def varying(array: npt.NDArray[np.generic], kind: Any) -> object:
             """An array that a run changes: kept with its first values."""
             array = _aligned(array)
             self._start.append((array, array.copy()))
             return array.ctypes.data_as(kind)
 
         inertia = np.zeros(len(group.units))
-        if group.inertia:
-            inertia = eq.p[:, dae.parameter_number(group.inertia)]
+        if structure.inertia:
+            inertia = eq.p[:, structure.column(structure.inertia)]
         mass = self.layout.in_lanes(inertia, packs)
         mass.ravel()[len(group.units) :] = 0.0
         many = packs * lanes
         struct = GroupStruct(
             packs=packs, nx=dae.x.numel(), np=eq.p.shape[1], nq=len(start), na=len(automata), rows=len(table),
-            bounds=len(structure.bounds), moving=moving, fixed=obj.fixed, fixed_columns=obj.fixed_columns,
+            bounds=len(structure.bounds), moving=len(structure.moving), fixed=obj.fixed,
+            fixed_columns=obj.fixed_columns,
             ports=ports, v_rows=rows, first_port=port, first_state=state, reads_v=int(not structure.affine),
             angle=dae.x_names.index(structure.angle) if structure.angle else -1,
-            p=doubles(self.layout.in_lanes(eq.p, packs)), moving_seed=doubles(self.layout.in_lanes(seeds, packs)),
+            p=doubles(self.layout.in_lanes(eq.p, packs)),
+            moving_seed=doubles(self.layout.in_lanes(seeds, packs)),
             held=doubles(self.layout.in_lanes(held, packs)), inertia=doubles(mass),
             q=varying(np.repeat(np.tile(start, packs), lanes), DOUBLES),
             entry=varying(np.zeros(many * max(len(automata), 1)), DOUBLES),
@@ -242,16 +247,11 @@ class Fleet:
             kept=doubles(np.zeros(many * max(obj.fixed, 1))),
             kept_columns=doubles(np.zeros(many * max(obj.fixed_columns * d, 1))),
             no_columns=doubles(np.zeros(many * max(obj.fixed_columns, len(automata), 1))),
-            mode=varying(
-                np.repeat(np.tile(np.array([a.mode_number(a.start) for a in automata] or [0]), packs), lanes).astype(
-                    c_long
-                ),
-                LONGS,
-            ),
+            mode=varying(np.repeat(np.tile(modes, packs), lanes).astype(c_long), LONGS),
             row_automaton=longs([a for a, _ in table]),
-            row_source=longs([automata[a].mode_number(r.source) for a, r in table]),  # type: ignore[attr-defined]
-            row_target=longs([automata[a].mode_number(r.target) for a, r in table]),  # type: ignore[attr-defined]
-            row_resets=longs([int(bool(r.reset)) for _, r in table]),  # type: ignore[attr-defined]
+            row_source=longs([automata[a].mode_number(r.source) for a, r in table]),
+            row_target=longs([automata[a].mode_number(r.target) for a, r in table]),
+            row_resets=longs([int(bool(r.reset)) for _, r in table]),
             flag_begin=longs(begins.tolist()), flag_width=longs(widths),
             flag_values=doubles(np.concatenate([*(f.ravel() for f in flags), [0.0]])),
             call=obj.functions,
@@ -267,7 +267,7 @@ class Fleet:
         """Compute what depends on parameters and flags alone."""
         call = ctypes.CFUNCTYPE(None, POINTER(GroupStruct), c_long, c_long)
         for struct, obj in zip(self._structs, self.layout.objects, strict=True):
-            function = call((ctypes.c_void_p * 6).from_address(obj.functions)[5])
+            function = call((ctypes.c_void_p * 6).from_address(obj.functions)[5] or 0)
             for pack in range(struct.packs):
                 function(byref(struct), pack, self.directions)
 
@@ -336,10 +336,12 @@ def simulate(
     x, xs = fleet.x.copy(), np.r_[fleet.xs, 0.0]
     start = np.r_[v_start.real, v_start.imag].astype(float)
     o = options
-    settings = OptionsStruct(o.rtol, o.atol, o.theta_rtol, o.theta_share, o.longest, o.out_of_step, o.max_steps)
+    settings = OptionsStruct(
+        o.rtol, o.atol, o.theta_rtol, o.theta_share, o.longest, o.out_of_step, o.max_steps
+    )
     code = dll.fleet_run(
-        byref(fleet.struct), byref(settings), len(stretches), table, _pointer(x), _pointer(xs), _pointer(start),
-        byref(record),
+        byref(fleet.struct), byref(settings), len(stretches), table, _pointer(x), _pointer(xs),
+        _pointer(start), byref(record),
     )  # fmt: skip
     done = record.n_samples
     named = tuple(_event(fleet, events[k]) for k in range(min(record.n_events, EVENT_ROOM)))
@@ -358,7 +360,7 @@ def _event(fleet: Fleet, event: Floats) -> tuple[float, str, str]:
     group, unit = fleet.layout.groups[int(event[1])], int(event[3])
     name = group.units[unit].name if unit < len(group.units) else ""  # a lane that repeats the last unit
     _, row = group.structure.rows[int(event[2])]
-    return float(event[0]), name, row.text  # type: ignore[attr-defined]
+    return float(event[0]), name, row.text
 
 
 def _status(fleet: Fleet, code: int, record: RecordStruct) -> str:
@@ -372,7 +374,7 @@ def _status(fleet: Fleet, code: int, record: RecordStruct) -> str:
         if code == 8:
             text += f" is {np.rad2deg(abs(record.amount)):.0f} deg from the centre of inertia"
         elif code == 2:
-            text += f", {group.structure.rows[record.row][1].text}"  # type: ignore[attr-defined]
+            text += f", {group.structure.rows[record.row][1].text}"
         else:
             state = group.structure.dae.states[group.structure.bounds[record.row][0]]
             text += f", {state.path}" + (f" ({state.crossing})" if state.crossing else "")

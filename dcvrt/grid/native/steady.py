@@ -77,9 +77,7 @@ class Steady:
         """
         equations = self._equations
         n, m = len(equations.free), len(equations.pq)
-        right = np.vstack(
-            [load[equations.free].real, load[equations.pq].imag, load[[equations.slack]].real]
-        )
+        right = np.vstack([load[equations.free].real, load[equations.pq].imag, load[[equations.slack]].real])
         move = -self._factors.solve(right)
         d_angle, d_size = np.zeros(load.shape), np.zeros(load.shape)
         d_angle[equations.free], d_size[equations.pq] = move[:n], move[n : n + m]
@@ -92,8 +90,8 @@ class Steady:
 class Equations:
     """Mismatch and Jacobian of one network with given held voltages; the pattern is laid out once.
 
-    Unknowns are the angles of `free`, the magnitudes of `pq` and the total; rows are P of `free`, Q of `pq` and P
-    of the slack bus.
+    Unknowns are the angles of `free`, the magnitudes of `pq` and the total; rows are P of `free`, Q of `pq`
+    and P of the slack bus.
     """
 
     def __init__(self, network: Network, kind: npt.NDArray[np.str_]) -> None:
@@ -169,7 +167,8 @@ class Flow:
         if len(np.unique(units.bus)) < len(units):
             twice = sorted({int(b) for b in units.bus if (units.bus == b).sum() > 1})
             raise InputError(
-                f"{network.name}: bus {', '.join(map(str, twice))} has several units; the native engine takes one "
+                f"{network.name}: bus {', '.join(map(str, twice))} has several units; the native "
+                "engine takes one "
                 "a bus. Way out: join them into one unit, or engine='andes'."
             )
         self._equations: dict[bytes, Equations] = {}
@@ -200,8 +199,8 @@ class Flow:
         Raises
         ------
         SimulationError
-            When there is no solution, with the bus of the largest mismatch; when the unit at the slack bus would
-            leave its limits.
+            When there is no solution, with the bus of the largest mismatch; when the unit at the slack bus
+            would leave its limits.
         InfeasibleError
             When the units cannot supply the load.
         """
@@ -226,7 +225,8 @@ class Flow:
             q, size = found.generation.imag, abs(found.v)
             over = (kind == "pv") & ((q > high + LIMIT_SLACK) | (q < low - LIMIT_SLACK))
             let_go = (kind == "pq") & (np.array(network.kind) == "pv")
-            # at its upper limit a unit has let the voltage sag; once it is above the set point, it holds it again
+            # at its upper limit a unit has let the voltage sag; once it is above the set point, it holds it
+            # again
             back = let_go & (((q_fixed == high) & (size > v_set)) | ((q_fixed == low) & (size < v_set)))
             if not over.any() and not back.any():
                 return found
@@ -245,7 +245,8 @@ class Flow:
         highest = float(network.generators.p_max[network.generator_index == network.slack].sum())
         if not -1e-6 <= p <= highest + 1e-6:
             raise SimulationError(
-                f"{where}: the unit at slack bus {network.bus[network.slack]} would generate {p:.0f} MW, outside "
+                f"{where}: the unit at slack bus {network.bus[network.slack]} would generate {p:.0f} "
+                "MW, outside "
                 f"0 to {highest:.0f} MW. Way out: redispatch='proportional', or host less."
             )
 
@@ -287,8 +288,10 @@ class Flow:
         if not level < ACCEPTED:
             worst = int(np.argmax(np.nan_to_num(abs(rest), nan=np.inf)))
             raise SimulationError(
-                f"{where}: power flow has no solution; the largest mismatch, {level * base:.3g} MVA, is at bus "
-                f"{network.bus[equations.bus_of(worst)]}. Way out: host less there, or check load_scale and the "
+                f"{where}: power flow has no solution; the largest mismatch, {level * base:.3g} MVA, "
+                "is at bus "
+                f"{network.bus[equations.bus_of(worst)]}. Way out: host less there, or check "
+                "load_scale and the "
                 "voltage set points."
             )
         let_go = np.flatnonzero((kind == "pq") & (np.array(network.kind) != "pq"))
@@ -323,12 +326,12 @@ def loads(
     load_scale: float,
 ) -> Phasors:
     """What the buses take, pu: network load times `load_scale`, hosted load (MVA), less wind (MW)."""
-    taken = load_scale * (network.p_load + 1j * network.q_load)
+    taken = np.asarray(load_scale * (network.p_load + 1j * network.q_load), dtype=np.complex128)
     for bus, mva in hosted.items():
         taken[network.index(bus)] += mva
     for bus, mw in wind.items():
         taken[network.index(bus)] -= mw
-    return taken / network.base_mva
+    return np.asarray(taken / network.base_mva, dtype=complex)
 
 
 def directions(
