@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
 from dcvrt.models import Diagram
+from dcvrt.models.machines import UnitBlock
 from dcvrt.waveform import Waveform
 
 Floats = npt.NDArray[np.float64]
@@ -92,6 +93,9 @@ class Grid:
         to their limits, losses included; `slack`: the unit at the slack bus.
     reactive_limits : bool
         Whether the native engine's power flow keeps units within their reactive limits; ANDES's does not.
+    load_model, wind_model : block of `dcvrt.models.machines`, optional
+        What network loads and wind are in a fault, for the native engine: `ExponentialLoad`, `ZipLoad`,
+        `CurrentConverter`. Impedances when not given.
     """
 
     name: str
@@ -102,6 +106,8 @@ class Grid:
     rule: bool = False
     redispatch: str = "proportional"
     reactive_limits: bool = False
+    load_model: UnitBlock | None = None
+    wind_model: UnitBlock | None = None
 
     @classmethod
     def from_case(
@@ -112,6 +118,8 @@ class Grid:
         dynamics: str | Path | None = None,
         redispatch: str = "proportional",
         reactive_limits: bool = False,
+        load_model: UnitBlock | None = None,
+        wind_model: UnitBlock | None = None,
     ) -> Grid:
         """Open a case.
 
@@ -129,6 +137,8 @@ class Grid:
             `proportional` or `slack`.
         reactive_limits : bool
             Whether the native engine's power flow keeps units within their reactive limits.
+        load_model, wind_model : block of `dcvrt.models.machines`, optional
+            What network loads and wind are in a fault, for the native engine; impedances when not given.
 
         Raises
         ------
@@ -138,7 +148,7 @@ class Grid:
         if str(case) == "ieee118":
             if dynamics is not None:
                 raise InputError("ieee118 has its own dynamic data; dynamics= is for case files.")
-            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch, reactive_limits)
+            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch)
         else:
             path = Path(case)
             if not path.suffix:
@@ -148,7 +158,8 @@ class Grid:
             if dynamics is None and path.suffix.lower() == ".raw" and beside.is_file():
                 dynamics = beside
             given = Path(dynamics) if dynamics else None
-            grid = cls(path.stem, path, tuple(sites), pf, given, False, redispatch, reactive_limits)
+            grid = cls(path.stem, path, tuple(sites), pf, given, False, redispatch)
+        grid = replace(grid, reactive_limits=reactive_limits, load_model=load_model, wind_model=wind_model)
         grid._check()
         return grid
 
@@ -306,6 +317,8 @@ class Grid:
             1 + 1j * float(np.tan(np.arccos(self.pf))),
             self.redispatch,
             self.reactive_limits,
+            self.load_model,
+            self.wind_model,
         )
 
     @property
@@ -369,6 +382,11 @@ class Grid:
         if engine == "andes":
             if wrt:
                 problems.append("wrt: ANDES gives no derivatives. Way out: engine='native'.")
+            if self.load_model or self.wind_model:
+                problems.append(
+                    "load_model, wind_model: engine='andes' has loads and wind as impedances. Way out: "
+                    "engine='native'."
+                )
             if self.reactive_limits:
                 problems.append(
                     "reactive_limits: the power flow of engine='andes' does not keep them. Way out: "

@@ -22,7 +22,7 @@ from dcvrt.grid.native.structure import SCALE, Structure
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
 from dcvrt.models import Diagram
-from dcvrt.models.machines import setpoints
+from dcvrt.models.machines import UnitBlock, alone, setpoints
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -107,6 +107,9 @@ class Engine:
         Who supplies a change of load, one of `redispatch.RULES`.
     reactive_limits : bool
         Whether units respect their reactive limits in the power flow.
+    load_model, wind_model : UnitBlock, optional
+        What network loads and wind are in a fault, a block for each bus that has any; impedances when not
+        given.
     """
 
     network: Network
@@ -115,6 +118,8 @@ class Engine:
     per_hosted: complex
     rule: str = "proportional"
     reactive_limits: bool = False
+    load_model: UnitBlock | None = None
+    wind_model: UnitBlock | None = None
     options: Options = field(default_factory=Options)
 
     @cached_property
@@ -140,10 +145,23 @@ class Engine:
         own = {unit.bus for group in coupled for unit in group.units}
         scale = period.dc_factor * self.per_hosted
         hosted = {bus: 0j if bus in own else scale * hosting.get(bus, 0.0) for bus in self.sites}
-        load = loads(network, hosted, period.wind, period.load_scale)
-        network_load = loads(network, {}, {}, 1.0)
+        own_load, wind = loads(network, {}, {}, period.load_scale), -loads(network, {}, period.wind, 0.0)
         outside = [("", None) if q.kind == "H" and q.bus in own else (q.kind, q.bus) for q in wrt]
-        changes = directions(network, outside, scale, network_load)
+
+        def change(*kinds: str) -> Phasors:
+            kept = [(kind, bus) if kind in kinds else ("", None) for kind, bus in outside]
+            return directions(network, kept, scale, loads(network, {}, {}, 1.0))
+
+        load, changes = loads(network, hosted, {}, 0.0), change("H")
+        fed: dict[str, tuple[Phasors, Phasors]] = {}
+        for kind, model, power, moved in (
+            ("load", self.load_model, -own_load, -change("load")),
+            ("wind", self.wind_model, wind, -change("wind")),
+        ):
+            if model is None:
+                load, changes = load - power, changes - moved
+            else:
+                fed[kind] = power, moved
         sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
         for row, unit in enumerate(unit for group in coupled for unit in group.units):
             sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
@@ -151,7 +169,30 @@ class Engine:
             self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
         )
         where = f"{network.name}, {period.name}"
-        return NativePoint(system, load, changes, sizes, self.rule, self.reactive_limits, where)
+        system = self._system(tuple(self._devices(fed)), coupled)
+        return NativePoint(system, load, changes, fed, sizes, self.rule, self.reactive_limits, where)
+
+    def _system(self, devices: tuple[Group, ...], coupled: tuple[Group, ...]) -> System:
+        if not devices and not coupled:
+            return self.system
+        return System(self.network, (*self.system.groups, *devices), self.system.points, coupled)
+
+    def _devices(self, fed: Mapping[str, tuple[Phasors, Phasors]]) -> Iterable[Group]:
+        """Loads and wind as units, one at each bus that has any."""
+        for kind, (power, _) in fed.items():
+            model = self.load_model if kind == "load" else self.wind_model
+            assert model is not None
+            if kind not in self._of_devices:
+                dae = alone(model).compile()
+                self._of_devices[kind] = Structure(dae, setpoints=setpoints(dae))
+            structure = self._of_devices[kind]
+            units = [Unit(f"{kind} at bus {bus}", int(bus), {}) for bus in self.network.bus[power != 0]]
+            if units:
+                yield Group(structure, units, kind)
+
+    @cached_property
+    def _of_devices(self) -> dict[str, Structure]:
+        return {}
 
     def _coupled(
         self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram]
