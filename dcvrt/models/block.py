@@ -5,14 +5,18 @@ The same `equations` run on numbers (in tests, by hand) and on CasADi symbols (w
 
 from __future__ import annotations
 
+import re
+import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import isnan
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import casadi as ca
 
-from dcvrt.errors import InputError, ModelError, did_you_mean, outside, raise_all
+from dcvrt.errors import DcvrtError, InputError, ModelError, did_you_mean, raise_all
 from dcvrt.models.automaton import Go
 from dcvrt.models.declared import (
     Algebraic,
@@ -25,9 +29,9 @@ from dcvrt.models.declared import (
     Port,
     State,
     UnknownNameError,
+    is_number,
 )
 from dcvrt.models.phasor import Phasor, Scalar
-from dcvrt.units import dimension
 
 __all__ = [
     "Algebraic",
@@ -93,22 +97,31 @@ class Block(Part):
             for name, d in vars(base).items()
             if isinstance(d, Declared)
         }
-        problems = []
+        problems: list[str] = []
         for name, d in cls._declared.items():
-            try:
-                dimension(d.unit)
-            except ModelError as error:
-                problems.append(f"{name}: {error}")
+            problems += d.problems()
             if hasattr(Block, name) or name in RESERVED - ({"mode"} if isinstance(d, Output) else set()):
                 problems.append(f"{name!r} is a name that every block has; choose another.")
+        if isinstance(cls.modes, str) or len(set(cls.modes)) < len(cls.modes):
+            problems.append(f"modes = {cls.modes!r} must be a tuple of different names: ('OFF', 'ON').")
+        elif not cls.modes and cls.transitions is not Block.transitions:
+            problems.append("there are transitions, but no modes. Declare modes and start.")
         for flag, column in cls.flags.items():
             if flag in cls._declared:
                 problems.append(f"the flag {flag!r} has the name of a symbol of the block.")
-            if len(column) != len(cls.modes):
+            if not isinstance(column, tuple | list) or not all(map(is_number, column)):
+                problems.append(f"the flag {flag!r} is {column!r}, not one number for each mode: (0.0, 1.0).")
+            elif len(column) != len(cls.modes):
                 problems.append(f"the flag {flag!r} has {len(column)} values for {len(cls.modes)} modes.")
         raise_all(problems, cls.__name__, ModelError)
 
-    def __init__(self, **values: float) -> None:
+    def __init__(self, *unnamed: float, **values: float) -> None:
+        if unnamed:
+            first = next(iter(self.declared(Parameter)), "name")
+            raise InputError(
+                f"{type(self).__name__}: values are given by name: "
+                f"{type(self).__name__}({first}={unnamed[0]!r})."
+            )
         self.values = {name: p.value for name, p in self.declared(Parameter).items()}
         self.sources = {name: p.source for name, p in self.declared(Parameter).items()}
         problems = [problem for name, value in values.items() if (problem := self.problem_of(name, value))]
@@ -126,10 +139,7 @@ class Block(Part):
         known = self.declared(Parameter)
         if parameter not in known:
             return f"there is no parameter {parameter!r}.{did_you_mean(parameter, known)}"
-        low, high = known[parameter].bounds
-        if not low <= value <= high:
-            return outside(parameter, value, known[parameter].unit, known[parameter].bounds)
-        return ""
+        return known[parameter].refusal(value, parameter)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -140,7 +150,10 @@ class Block(Part):
 
     def equations(self, s: Any) -> Equations:
         """Derivatives, outputs and residuals as pure functions of the namespace `s`."""
-        raise NotImplementedError(f"{type(self).__name__} gives no equations.")
+        raise ModelError(
+            f"{type(self).__name__} gives no equations. Write equations(self, s), which returns "
+            "Equations(der=..., out=...)."
+        )
 
     def transitions(self, s: Any) -> tuple[Go, ...]:
         """Rows of the table of modes, tried from top to bottom."""
@@ -201,7 +214,7 @@ class Block(Part):
         {'i': ('v', 'delta', 'p_c', 'q_c'), 'v_dq': ('v', 'delta')}
         """
         s = self.symbols(self.name or type(self).__name__)
-        out = self.equations(s).out
+        out = on_symbols(self, "equations", s).out
         inputs = self.declared(Input)
         return {
             name: tuple(k for k in inputs if ca.depends_on(stack([out[name]]), stack([getattr(s, k)])))
@@ -224,6 +237,12 @@ class Block(Part):
         return notes
 
 
+def scalars(value: Any) -> list[Scalar]:
+    """The numbers or symbols that a value consists of: one, or two of a phasor; none of anything else."""
+    flat = [value.re, value.im] if isinstance(value, Phasor) else [value]
+    return flat if all(is_number(v) or (isinstance(v, ca.SX) and v.numel() == 1) for v in flat) else []
+
+
 def stack(columns: Iterable[Any]) -> ca.SX:
     """Numbers, symbols, columns and phasors in one column of SX."""
     flat: list[Any] = []
@@ -231,6 +250,55 @@ def stack(columns: Iterable[Any]) -> ca.SX:
         flat += [value.re, value.im] if isinstance(value, Phasor) else [value]
     joined: Any = ca.vertcat(*flat) if flat else ca.SX(0, 1)
     return ca.SX(joined)
+
+
+def on_symbols(block: Block, method: str, s: Namespace) -> Any:
+    """What a method of a block gives on symbols.
+
+    Raises
+    ------
+    ModelError
+        the method fails there; the message shows the line, and what to write instead.
+    """
+    try:
+        return getattr(block, method)(s)
+    except DcvrtError:
+        raise
+    except Exception as error:
+        where = ""
+        for frame in traceback.extract_tb(error.__traceback__)[1:2]:  # that of the method
+            where = f" at {frame.line!r} ({Path(frame.filename).name}, line {frame.lineno})"
+        told = re.sub(r"^\S+:\d+: ", "", next((line for line in str(error).splitlines() if line.strip()), ""))
+        way_out = next((way for sign, way in WAYS_OUT.items() if sign in told), "")
+        raise ModelError(
+            f"{s._owner}: {method}() fails on symbols{where}: "
+            f"{type(error).__name__}: {told.rstrip('.')}.{way_out}"
+        ) from error
+
+
+WAYS_OUT = {
+    "guard": " Compare with below, above, within or outside, and join guards with & and |.",
+    "truth value": " A symbol is neither true nor false: put a smooth function (dcvrt.models.smooth) in the "
+    "place of if, max, min and comparisons, or make the cases modes.",
+    "Port": " `self` holds ports, `s` their values: write s.name.",
+    "Phasor": " A phasor v has the parts v.re and v.im and the magnitude smooth.mag(v, eps).",
+    "attribute 're'": " A phasor is added to phasors only: Phasor(1.0, 0.0). A number has no parts.",
+    "numpy": " Take functions from casadi, which know numbers and symbols: ca.exp(x), ca.sin(x).",
+}
+"""What to do about an error in the equations, by a part of its text."""
+
+
+def holds_nan(value: Any) -> bool:
+    """Whether NaN stands somewhere in an expression, as ``math.exp`` of a symbol leaves it."""
+    expression = stack([value])
+    f = ca.Function("look", [stack(ca.symvar(expression))], [expression])
+    return any(
+        f.instruction_id(k) == ca.OP_CONST and isnan(f.instruction_constant(k))
+        for k in range(f.n_instructions())
+    )
+
+
+NO_NUMBER = "holds NaN. Functions of `math` turn symbols into it: take them from casadi, as ca.exp(x)."
 
 
 def check_equations(path: str, block: Block, eq: Any) -> list[str]:
@@ -247,11 +315,17 @@ def check_equations(path: str, block: Block, eq: Any) -> list[str]:
         for name in wanted:
             if name not in given:
                 problems.append(f"{who}: no equation for {what} {name!r}.")
-            elif (wanted[name].kind is Phasor) != isinstance(given[name], Phasor):
+            elif not (parts := scalars(given[name])) or (wanted[name].kind is Phasor) != (len(parts) == 2):
+                value: Any = given[name]
+                found = type(value).__name__
+                if isinstance(value, ca.SX) and value.numel() != 1:
+                    found = f"a column of {value.numel()}"
                 problems.append(
                     f"{who}: {what} {name!r} is declared as {wanted[name].kind.__name__}, "
-                    f"but its equation gives {type(given[name]).__name__}."
+                    f"but its equation gives {found}."
                 )
+            elif holds_nan(given[name]):
+                problems.append(f"{who}: the equation for {what} {name!r} {NO_NUMBER}")
         for name in given:
             if name not in wanted:
                 problems.append(

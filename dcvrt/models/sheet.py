@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dcvrt.errors import InputError, did_you_mean
-from dcvrt.models.block import Block
+from dcvrt.models.block import Block, on_symbols
 from dcvrt.models.declared import Algebraic, Declared, Input, Output, Parameter, State
 from dcvrt.models.diagram import Diagram
 from dcvrt.models.expressions import text_of
@@ -141,6 +141,6 @@ def _modes(path: str, block: Block) -> list[Node]:
     short = shortener(path)
     rows = tuple(
         (row.source, row.target, short(str(row.when)), short(text_of(row.held)))
-        for row in block.transitions(block.symbols(path))
+        for row in on_symbols(block, "transitions", block.symbols(path))
     )
     return [Table(("mode", *block.flags), flags), Table(("from", "to", "when", "held (s)"), rows)]
