@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.errors import InputError, did_you_mean, outside
+from dcvrt.errors import InputError, did_you_mean, refusal
 
 if TYPE_CHECKING:
     from dcvrt.linear import Linear, OperatingPoint
@@ -246,9 +246,8 @@ class Dae:
                 problems.append(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
                 continue
             row = self.parameter_rows[self.p_names.index(path)]
-            low, high = row.bounds
-            if not low <= value <= high:
-                problems.append(outside(path, value, row.unit, row.bounds))
+            if problem := refusal(path, value, row.unit, row.bounds):
+                problems.append(problem)
                 continue
             values[self.p_names.index(path)] = value
         if changes and not problems:
@@ -283,9 +282,8 @@ class Dae:
         numbers = iter(np.array(self._together(values)).ravel())
         problems = []
         for tied in self.tied:
-            low, high = tied.bounds
-            if not low <= (value := next(numbers)) <= high:
-                problems.append(outside(tied.what, value, tied.unit, tied.bounds))
+            if problem := refusal(tied.what, next(numbers), tied.unit, tied.bounds):
+                problems.append(problem)
         for a in self.automata:
             for gap in a.gaps:
                 width, limits = next(numbers), [(name, next(numbers)) for name, _ in gap.limits]

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from dcvrt.errors import DcvrtError, InputError, ModelError, did_you_mean, raise_all
+from dcvrt.errors import DcvrtError, InputError, ModelError, did_you_mean, is_number, raise_all
 from dcvrt.models.automaton import Go
 from dcvrt.models.declared import (
     Algebraic,
@@ -29,7 +29,6 @@ from dcvrt.models.declared import (
     Port,
     State,
     UnknownNameError,
-    is_number,
 )
 from dcvrt.models.phasor import Phasor, Scalar
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import inf
-from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import casadi as ca
 
-from dcvrt.errors import ModelError, did_you_mean, outside
+from dcvrt.errors import ModelError, did_you_mean, is_number, outside, refusal
 from dcvrt.models.phasor import Phasor
 from dcvrt.units import BASES, dimension
 
@@ -20,11 +19,6 @@ if TYPE_CHECKING:
 
 class UnknownNameError(ModelError, AttributeError):
     """A symbol or port that a block or a diagram does not declare."""
-
-
-def is_number(value: Any) -> bool:
-    """Whether it is one plain real number: no text, no symbol, no array, no truth value."""
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def as_float(value: Any) -> Any:
@@ -106,10 +100,7 @@ class Parameter(Declared):
         """Why it cannot have this value, at this path; an empty text when it can."""
         if isinstance(value, ca.SX):
             return f"{path} = {value} is an expression; a value is a number. Tie it with the diagram's bind."
-        if not is_number(value):
-            return f"{path} = {value!r} is not a number."
-        low, high = self.bounds
-        return "" if low <= value <= high else outside(path, value, self.unit, self.bounds)
+        return refusal(path, value, self.unit, self.bounds)
 
     def __get__(self, block: Any, owner: type | None = None) -> Any:
         return self if block is None else block.values[self.name]

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import casadi as ca
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, ModelError, did_you_mean, raise_all
+from dcvrt.errors import InputError, ModelError, did_you_mean, is_number, raise_all
 from dcvrt.models.declared import (
     D,
     Declared,
@@ -20,7 +20,6 @@ from dcvrt.models.declared import (
     Part,
     Port,
     UnknownNameError,
-    is_number,
 )
 from dcvrt.models.phasor import Scalar
 from dcvrt.models.wiring import End, Wire, driven_twice

@@ -111,6 +111,14 @@ def test_values_have_names():
     assert told(lambda: Lag(2.0)) == "Lag: values are given by name: Lag(T=2.0)."
 
 
+def test_a_value_of_a_run_is_a_number():
+    dae = alone(Lag()).compile()
+    for value in ("2", None, [1.0]):
+        assert told(lambda value=value: dae.parameter_values(**{"b.T": value})) == (
+            f"b.T = {value!r} is not a number."
+        )
+
+
 # ---- declarations -----------------------------------------------------------------------------------------
 
 
