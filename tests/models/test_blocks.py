@@ -57,7 +57,11 @@ def kinds_of(base):
 for module in pkgutil.walk_packages(models.__path__, f"{models.__name__}."):
     importlib.import_module(module.name)
 BLOCKS = sorted(
-    {kind for kind in kinds_of(Block) if kind.__module__.startswith(f"{models.__name__}.")},
+    {
+        kind
+        for kind in kinds_of(Block)
+        if kind.__module__.startswith(f"{models.__name__}.") and kind.equations is not Block.equations
+    },
     key=lambda kind: kind.__name__,
 )
 """Every block in the package, whether or not somebody has thought of naming it in `dcvrt.models`."""
