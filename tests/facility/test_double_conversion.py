@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from dcvrt import Criteria, Simulator, Waveform, margins
+from dcvrt import Criteria, Simulator, Waveform, facility, margins
 from dcvrt.dae import Dae
 from dcvrt.facility import double_conversion
 from dcvrt.integrators import Casadi
@@ -27,15 +27,9 @@ from tests.facility.rides import FIXED
 from tests.models.sources import TIGHT, Audit, walk
 
 approx = pytest.approx
-BUILDERS: dict[str, Callable[[], Diagram]] = {
-    "gfl": double_conversion.gfl,
-    "gfm": double_conversion.gfm,
-    "gfm-droop": double_conversion.gfm_droop,
-    "gfl-support": double_conversion.gfl_support,
-    "gfl-sag-counter": double_conversion.gfl_sag_counter,
-    "gfl-vfd-cooling": double_conversion.gfl_vfd_cooling,
-}
-NAMES = tuple(BUILDERS)
+NAMES = tuple(name for name in facility.names() if "lim" in facility.get(name).blocks)
+"""Every variant whose import passes a current limiter."""
+BUILDERS: dict[str, Callable[[], Diagram]] = {name: facility.VARIANTS[name] for name in NAMES}
 
 
 def with_losses() -> Diagram:
