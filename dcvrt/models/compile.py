@@ -13,19 +13,9 @@ from dcvrt.dae import Automaton, Dae, Row, Tied
 from dcvrt.errors import ModelError, did_you_mean, raise_all
 from dcvrt.models.algebraic import check_regular
 from dcvrt.models.automaton import Go
-from dcvrt.models.block import (
-    Algebraic,
-    Equations,
-    Input,
-    Output,
-    Parameter,
-    State,
-    check_equations,
-    on_symbols,
-    stack,
-)
-from dcvrt.models.declared import Declared
+from dcvrt.models.declared import Algebraic, Declared, Input, Output, Parameter, State
 from dcvrt.models.diagram import Diagram
+from dcvrt.models.evaluation import Equations, check_equations, on_symbols, stack
 from dcvrt.models.expressions import text_of
 from dcvrt.models.netlist import Netlist, netlist
 from dcvrt.models.phasor import Phasor, Scalar

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dcvrt.errors import InputError, did_you_mean
-from dcvrt.models.block import Block, on_symbols
+from dcvrt.models.block import Block
 from dcvrt.models.declared import Algebraic, Declared, Input, Output, Parameter, State
 from dcvrt.models.diagram import Diagram
+from dcvrt.models.evaluation import on_symbols
 from dcvrt.models.expressions import text_of
 from dcvrt.models.netlist import Netlist, netlist
 from dcvrt.models.prose import Heading, Items, Node, Table, Text, parse

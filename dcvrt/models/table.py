@@ -12,7 +12,8 @@ import numpy as np
 from dcvrt.dae import Automaton, Gap, Transition
 from dcvrt.errors import ModelError, did_you_mean, raise_all
 from dcvrt.models.automaton import check_table, gaps
-from dcvrt.models.block import NO_NUMBER, State, holds_nan
+from dcvrt.models.declared import State
+from dcvrt.models.evaluation import NO_NUMBER, holds_nan
 
 if TYPE_CHECKING:
     from dcvrt.models.compile import Flattener

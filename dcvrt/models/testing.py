@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.models.block import Block, Equations, check_equations, on_symbols, scalars, stack
+from dcvrt.models.block import Block, Equations
 from dcvrt.models.declared import Algebraic, Declared, Input, Parameter, State
+from dcvrt.models.evaluation import check_equations, on_symbols, scalars, stack
 from dcvrt.models.phasor import Phasor
 
 Array = NDArray[np.float64]
