@@ -56,11 +56,11 @@ def check_regular(name: str, g: ca.SX, z: ca.SX, rows: Sequence[Row]) -> None:
         )
 
 
-def eliminated(dae: Dae, wanted: bool | Sequence[str]) -> Dae:
+def eliminated(dae: Dae, wanted: bool | Sequence[str], strict: bool = True) -> Dae:
     """The system with algebraic variables put in terms of the others: see :meth:`Diagram.compile`.
 
     Equations are taken in block-triangular order. A block of one or several must be affine in its variables,
-    0 = a z + b, and is solved as z = -b/a.
+    0 = a z + b, and is solved as z = -b/a. Those that are not are an error, or kept when not `strict`.
     """
     paths = tuple(row.path for row in dae.algebraics)
     if isinstance(wanted, str):
@@ -84,6 +84,8 @@ def eliminated(dae: Dae, wanted: bool | Sequence[str]) -> Dae:
     used = [equation_of[k] for k in gone]
     z, g = dae.z[gone], dae.g[used]
     solution, stuck = _solve(g, z)
+    if stuck and not strict:
+        return eliminated(dae, [paths[k] for j, k in enumerate(gone) if j not in stuck], strict=False)
     if stuck:
         names = [paths[gone[k]] for k in stuck]
         others = tuple(path for path in chosen if path not in names)

@@ -105,7 +105,9 @@ def always() -> Guard:
 class Go:
     """Row of a table: from `source` to `target` once `when` has been true for longer than `held` (s).
 
-    `reset` gives states of the block the value they jump to; all others are continuous.
+    `reset` gives states of the block the value they jump to; all others are continuous. `settles` says, in
+    words, why the row and its opposite cannot chatter where their limits leave no gap, as those of a limiter
+    whose output is continuous over the limit.
     """
 
     source: str
@@ -113,6 +115,7 @@ class Go:
     when: Guard
     held: Scalar = 0
     reset: Mapping[str, Scalar] = field(default_factory=dict)
+    settles: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.when, Guard):
@@ -155,20 +158,41 @@ def check_table(modes: Sequence[str], start: str, rows: Sequence[Go]) -> list[st
     return problems
 
 
-def gaps(rows: Sequence[Go], settle: Callable[[Scalar], ca.SX | None]) -> list[Gap]:
+def gaps(
+    rows: Sequence[Go], settle: Callable[[Scalar], ca.SX | None], states: Mapping[str, ca.SX] | None = None
+) -> list[Gap]:
     """Pairs of rows A -> B and B -> A, with the distance that their limits must keep for them not to chatter.
 
     In every combination of their cases some signal must not be able to satisfy both. Timers (a guard that is
     always true) are left out: their dwell time separates the jumps. `settle` puts an expression in terms of
     the parameters, or gives None where it varies in time: such a distance cannot be told before a run, and is
     left to the guard against chatter in the run.
+
+    Two kinds of pairs need no distance: those of which both rows say why they settle, and those in which a
+    reset sets a signal of a guard to its own limit, as a state that is put on the limit it ran into: the
+    guard is then false, and stays so unless the state moves outwards again.
     """
     found = []
+    symbols = states or {}
+
+    def undone(case: tuple[Comparison, ...], row: Go) -> bool:
+        """Whether a guard is false once the states of a row have been reset."""
+        known = [key for key in row.reset if key in symbols]
+        if not known:
+            return False
+        own, values = ca.vertcat(*[symbols[k] for k in known]), ca.vertcat(*[row.reset[k] for k in known])
+        margins = [ca.substitute(ca.SX(c.margin), own, ca.SX(values)) for c in case]
+        return any(bool(ca.simplify(margin).is_zero()) for margin in margins)
+
     for there, back in itertools.combinations(rows, 2):
         opposite = (there.source, there.target) == (back.target, back.source)
         if not opposite or () in there.when.cases + back.when.cases:
             continue
+        if there.settles and back.settles:
+            continue
         for one, other in itertools.product(there.when.cases, back.when.cases):
+            if any(undone(case, row) for case in (one, other) for row in (there, back)):
+                continue
             against = [
                 (a, b)
                 for a, b in itertools.product(one, other)

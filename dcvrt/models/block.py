@@ -44,6 +44,9 @@ __all__ = [
 RESERVED = {"values", "sources", "clock", "mode"}
 """Names that mean something to every block, beside those of the class."""
 
+SHORTEST = 1e-6
+"""Time constants that are not 0 may be set down to here, s, once they are compiled."""
+
 
 class Namespace(SimpleNamespace):
     """The symbols, or numbers, that a block's equations see as `s`."""
@@ -72,6 +75,8 @@ class Block(Part):
     modes: ClassVar[tuple[str, ...]] = ()
     start: ClassVar[str] = ""
     flags: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    optional_terms: ClassVar[bool] = False
+    """Whether its values decide which terms the equations have, so that a parameter may be without effect."""
     _declared: ClassVar[dict[str, Declared]] = {}
 
     def __init_subclass__(cls) -> None:
@@ -87,6 +92,13 @@ class Block(Part):
             problems += d.problems()
             if hasattr(Block, name) or name in RESERVED - ({"mode"} if isinstance(d, Output) else set()):
                 problems.append(f"{name!r} is a name that every block has; choose another.")
+            if isinstance(d, State) and d.time:
+                lag = cls._declared.get(d.time)
+                if not isinstance(lag, Parameter) or lag.unit != "s" or lag.bounds[0] < 0:
+                    problems.append(
+                        f"{name}: its time constant {d.time!r} must be a parameter of the block in s, "
+                        "with bounds from 0 on."
+                    )
         if isinstance(cls.modes, str) or len(set(cls.modes)) < len(cls.modes):
             problems.append(f"modes = {cls.modes!r} must be a tuple of different names: ('OFF', 'ON').")
         elif not cls.modes and cls.transitions is not Block.transitions:
@@ -150,6 +162,43 @@ class Block(Part):
         Where these lead in a ring from a state back to itself, the declared `start` is taken instead.
         """
         return {}
+
+    # ---- time constants that are 0 --------------------------------------------------------------------
+
+    def lagless(self) -> tuple[str, ...]:
+        """States that are none on this block, because their time constant is 0.
+
+        >>> from dcvrt.models import CurrentLag
+        >>> CurrentLag().lagless()
+        ()
+        """
+        states = self.declared(State).items()
+        return tuple(name for name, state in states if state.time and self.values[state.time] == 0)
+
+    def settable(self, parameter: str) -> tuple[float, float]:
+        """Range that a parameter keeps once the block is compiled.
+
+        A time constant that is 0 stays 0, and one that is not stays above 0: otherwise the system would be
+        another one.
+        """
+        low, high = self.declared(Parameter)[parameter].bounds
+        value = self.values[parameter]
+        if not any(state.time == parameter for state in self.declared(State).values()):
+            return low, high
+        return (max(low, min(value, SHORTEST)), high) if value else (0.0, 0.0)
+
+    def reduced(self, eq: Equations, s: Any) -> Equations:
+        """The equations with time constants divided out, and those that are 0 among the residuals."""
+        gone, states = self.lagless(), self.declared(State)
+        return Equations(
+            der={
+                name: side / getattr(s, states[name].time) if states[name].time else side
+                for name, side in eq.der.items()
+                if name not in gone
+            },
+            out=eq.out,
+            alg={**eq.alg, **{name: eq.der[name] for name in gone}},
+        )
 
     # ---- use ------------------------------------------------------------------------------------------
 

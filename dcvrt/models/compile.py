@@ -63,10 +63,13 @@ class Flattener:
         self.rests: dict[str, Mapping[str, Scalar]] = {}
         problems = []
         for path, block in net.blocks.items():
-            self.eq[path] = on_symbols(block, "equations", self.s[path])
+            given = on_symbols(block, "equations", self.s[path])
             self.rows[path] = on_symbols(block, "transitions", self.s[path])
             self.rests[path] = on_symbols(block, "rest", self.s[path])
-            problems += check_equations(path, block, self.eq[path])
+            wrong = check_equations(path, block, given)
+            problems += wrong
+            self.eq[path] = given if wrong else block.reduced(given, self.s[path])
+        problems += self.time_problems()
         raise_all(problems, net.name, ModelError)
         self.u = {name: signal(name, declared.kind) for name, (declared, _) in net.inputs.items()}
         self.implicit = {
@@ -86,15 +89,37 @@ class Flattener:
     def idle(self, path: str) -> Iterator[str]:
         """Parameters of a block that it does not use: whoever set them would see no effect."""
         block, s, eq = self.net.blocks[path], self.s[path], self.eq[path]
+        if block.optional_terms:
+            return
         used = [*eq.der.values(), *eq.out.values(), *eq.alg.values(), *self.rests[path].values()]
         for row in self.rows[path]:
             used += [row.when.margin, row.held, *row.reset.values()]
-        for name in block.declared(Parameter):
+        lags = {state.time for state in block.declared(State).values()}  # a time constant may be 0
+        for name in (name for name in block.declared(Parameter) if name not in lags):
             if not ca.depends_on(stack(used), getattr(s, name)):
                 yield (
                     f"{path} ({block.label}): nothing depends on the parameter {name!r}. Equations read "
                     f"s.{name}; self.{name} is a number that no run can change. Use it or drop it."
                 )
+
+    def time_problems(self) -> list[str]:
+        """Time constants that are bound to something whose being 0 or not is another than the block's own."""
+        shared = self.net.shared.values()
+        symbols, values = [v.symbol for v in shared], [v.declared.value for v in shared]
+        problems = []
+        for path, block in self.net.blocks.items():
+            for name in {state.time for state in block.declared(State).values()} - {""}:
+                bound = self.net.bindings.get((path, name))
+                if bound is None:
+                    continue
+                number = float(ca.Function("v", symbols, [ca.SX(bound)])(*values))
+                if (number == 0) != (block.values[name] == 0):
+                    problems.append(
+                        f"{path}.{name} is bound to {text_of(bound)} = {number:g} s, but the block was made "
+                        f"with {block.values[name]:g} s. What is a state must be known when the block is "
+                        f"made: give it {name} = {number:g} as well."
+                    )
+        return problems
 
     # ---- values ---------------------------------------------------------------------------------------
 
@@ -165,14 +190,18 @@ class Flattener:
     def states(self) -> Iterator[tuple[str, State]]:
         """Every state with the name of its block, in the order of `x`."""
         for name, block in self.net.blocks.items():
+            gone = block.lagless()
             for state in block.declared(State).values():
-                yield name, state
+                if state.name not in gone:
+                    yield name, state
 
     def unknowns(self) -> list[Unknown]:
-        """Algebraic variables: those that blocks declare and those of implicit wires."""
+        """Algebraic variables: of blocks, states whose time constant is 0, those of implicit wires."""
         found = []
         for name, block in self.net.blocks.items():
-            for key, d in block.declared(Algebraic).items():
+            states = block.declared(State)
+            lagless = {key: states[key] for key in block.lagless()}
+            for key, d in (block.declared(Algebraic) | lagless).items():
                 residual = stack([self.resolve(name, self.eq[name].alg[key])])
                 found.append(
                     Unknown(
@@ -200,7 +229,7 @@ class Flattener:
             for key, d in block.declared(Parameter).items():
                 if (name, key) not in self.net.bindings:
                     value, source = block.values[key], block.sources[key]
-                    rows.append(Row(f"{name}.{key}", d.unit, value, d.bounds, d.doc, source))
+                    rows.append(Row(f"{name}.{key}", d.unit, value, block.settable(key), d.doc, source))
                     symbols.append(getattr(self.s[name], key))
         return rows, stack(symbols)
 
@@ -208,9 +237,10 @@ class Flattener:
         """The parameters of blocks that are bound, each with the range that its block allows."""
         for (path, name), expression in self.net.bindings.items():
             if path in self.net.blocks:
-                d = self.net.blocks[path].declared(Parameter)[name]
+                block = self.net.blocks[path]
+                d = block.declared(Parameter)[name]
                 what = f"{path}.{name} (bound to {text_of(expression)})"
-                yield Tied(what, d.unit, d.bounds, ca.SX(expression))
+                yield Tied(what, d.unit, block.settable(name), ca.SX(expression))
 
     def inputs(self) -> list[Row]:
         """Rows of the inputs with their values at rest."""

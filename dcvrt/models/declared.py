@@ -126,6 +126,9 @@ class State(Declared):
 
     `start` is the value that the search of the equilibrium begins with, unless the block's `rest` gives a
     better one. `bounds` is the range in which the equations are valid, `crossing` what it means to leave it.
+
+    `time` names the parameter that is its time constant T. Its equation is then given as the right side of
+    T dx/dt = ..., and on a block where T is 0 it is no state but the variable that 0 = ... defines.
     """
 
     form: ClassVar[str] = "State(0.0, 'pu(V)', 'meaning')"
@@ -133,6 +136,7 @@ class State(Declared):
     start: float = 0.0
     bounds: tuple[float, float] = (-inf, inf)
     crossing: str = ""
+    time: str = ""
 
     def __init__(
         self,
@@ -141,9 +145,10 @@ class State(Declared):
         doc: str = "",
         bounds: tuple[float, float] = (-inf, inf),
         crossing: str = "",
+        time: str = "",
     ) -> None:
         self.name, self.unit, self.doc, self.kind = "", unit, doc, float
-        self.start, self.bounds, self.crossing = as_float(start), bounds, crossing
+        self.start, self.bounds, self.crossing, self.time = as_float(start), bounds, crossing, time
 
     def problems(self) -> Iterator[str]:
         yield from super().problems()

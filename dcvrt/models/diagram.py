@@ -273,8 +273,9 @@ class Diagram(Part):
         Parameters
         ----------
         eliminate : algebraic variables to put in terms of the others, where their equations allow it: paths,
-            or True for all. By default every one is kept, to be solved along with the states. An eliminated
-            variable appears in the results only if it is an output.
+            or True for all. By default every one is kept, to be solved along with the states, but for states
+            whose time constant is 0 and whose equation is explicit. An eliminated variable appears in the
+            results only if it is an output.
 
         Raises
         ------
@@ -286,8 +287,14 @@ class Diagram(Part):
         """
         from dcvrt.models.algebraic import eliminated
         from dcvrt.models.compile import flatten
+        from dcvrt.models.netlist import netlist
 
-        return eliminated(flatten(self), eliminate)
+        lagless = [
+            f"{path}.{name}" for path, block in netlist(self).blocks.items() for name in block.lagless()
+        ]
+        dae = eliminated(flatten(self), lagless, strict=False)
+        rest = eliminate if isinstance(eliminate, (bool, str)) else [e for e in eliminate if e not in lagless]
+        return eliminated(dae, rest)
 
     def feedthrough(self) -> dict[str, tuple[str, ...]]:
         """Inputs that each output depends on at once, without a state between: read from the equations."""

@@ -19,7 +19,10 @@ from dcvrt.models.phasor import Phasor, Scalar
 
 @dataclass(frozen=True)
 class Equations:
-    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable."""
+    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable.
+
+    For a state that names its time constant T, `der` holds the right side of T dx/dt = ...
+    """
 
     der: Mapping[str, Scalar] = field(default_factory=dict)
     out: Mapping[str, Scalar | Phasor] = field(default_factory=dict)

@@ -28,7 +28,7 @@ def build_automaton(flat: Flattener, name: str, p: ca.SX) -> Automaton:
     problems = check_table(block.modes, block.start, rows)
     raise_all(problems, who, ModelError)
 
-    states = list(block.declared(State))
+    states = [key for key in block.declared(State) if key not in block.lagless()]
     for row in rows:
         step = f"{row.source} -> {row.target}"
         for value in (row.when.margin, row.held, *row.reset.values()):
@@ -83,7 +83,7 @@ def build_automaton(flat: Flattener, name: str, p: ca.SX) -> Automaton:
                 gap.width,
                 tuple((short(n), v) for n, v in gap.limits),
             )
-            for gap in gaps(rows, of_parameters)
+            for gap in gaps(rows, of_parameters, {key: getattr(s, key) for key in states})
         ),
     )
 

@@ -204,7 +204,7 @@ def test_declarations_of_a_diagram_are_checked_on_the_spot():
             "the flag 'on' is 1.0, not one number for each mode: (0.0, 1.0).",
         ),
     ],
-    ids=str,
+    ids=["text", "twice", "no modes", "flag"],
 )
 def test_modes_and_flags(body, text):
     assert told(lambda: type("Mine", (Block,), body)) == f"Mine: {text}"
@@ -293,6 +293,18 @@ def test_a_parameter_that_equations_read_from_self_would_never_change():
         "mine: b (Mine): nothing depends on the parameter 'T'. Equations read s.T; self.T is a number that "
         "no run can change. Use it or drop it."
     )
+
+
+def test_a_block_with_optional_terms_may_leave_a_parameter_out():
+    class Plain(Lag):
+        """A lag with a bend that is only there when b is not 0."""
+
+        optional_terms = True
+        b = Parameter(0.0, "1", (0.0, 1.0), "bend", "test")
+
+    assert alone(Plain()).compile().p_names == ("b.T", "b.b")
+    Plain.optional_terms = False
+    assert "nothing depends on the parameter 'b'" in told(alone(Plain()).compile)
 
 
 # ---- modes ------------------------------------------------------------------------------------------------
