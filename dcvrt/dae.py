@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.errors import InputError, did_you_mean, outside
+from dcvrt.errors import InputError, did_you_mean, refusal
 
 if TYPE_CHECKING:
     from dcvrt.linear import Linear, OperatingPoint
@@ -87,6 +87,25 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Tied:
+    """A number that follows from the parameters and has a range of its own.
+
+    A parameter of a block that is bound to an expression, or a dwell time.
+
+    Attributes
+    ----------
+    what : what it is, as messages name it.
+    unit, bounds : its unit, and the range in which it must lie.
+    value : SX expression of the parameters.
+    """
+
+    what: str
+    unit: str
+    bounds: tuple[float, float]
+    value: ca.SX
+
+
+@dataclass(frozen=True)
 class Automaton:
     """Modes, the flags each mode sets, and the rows that lead from one to another, tried top to bottom.
 
@@ -133,6 +152,7 @@ class Dae:
     start : SX column of `x` then `z`, start values as functions of `p` and `u` for the search of the
         equilibrium (a guess, not the equilibrium itself).
     notes : deviations from the paper, one line each ('path: text').
+    tied : what follows from the parameters and must stay within a range of its own.
     """
 
     name: str
@@ -152,6 +172,7 @@ class Dae:
     automata: tuple[Automaton, ...] = ()
     start: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     notes: tuple[str, ...] = ()
+    tied: tuple[Tied, ...] = ()
 
     @property
     def parameters(self) -> ParameterTable:
@@ -215,8 +236,8 @@ class Dae:
         Raises
         ------
         InputError
-            unknown names and values outside their bounds, all at once; limits of guards that would leave no
-            hysteresis between two modes.
+            unknown names and values outside their bounds, all at once; bound parameters that they would take
+            outside theirs, and limits of guards that would leave no hysteresis between two modes.
         """
         values = np.array([r.value for r in self.parameter_rows], dtype=float)
         problems = []
@@ -225,13 +246,12 @@ class Dae:
                 problems.append(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
                 continue
             row = self.parameter_rows[self.p_names.index(path)]
-            low, high = row.bounds
-            if not low <= value <= high:
-                problems.append(outside(path, value, row.unit, row.bounds))
+            if problem := refusal(path, value, row.unit, row.bounds):
+                problems.append(problem)
                 continue
             values[self.p_names.index(path)] = value
         if changes and not problems:
-            problems = [f"{self.name}: {problem}" for problem in self.chatter(values)]
+            problems = [f"{self.name}: {problem}" for problem in self.conflicts(values)]
         if problems:
             raise InputError("\n".join(problems))
         return values
@@ -254,10 +274,16 @@ class Dae:
 
         return linearise(self, at)
 
-    def chatter(self, values: Array) -> list[str]:
-        """Pairs of rows between which the parameter values leave no hysteresis, one message each."""
+    def conflicts(self, values: Array) -> list[str]:
+        """What the parameter values, each within its bounds, do together that cannot be: one message each.
+
+        Bound parameters and dwell times outside their range; pairs of rows without hysteresis.
+        """
+        numbers = iter(np.array(self._together(values)).ravel())
         problems = []
-        numbers = iter(np.array(self._gaps(values)).ravel() if self.automata else ())
+        for tied in self.tied:
+            if problem := refusal(tied.what, next(numbers), tied.unit, tied.bounds):
+                problems.append(problem)
         for a in self.automata:
             for gap in a.gaps:
                 width, limits = next(numbers), [(name, next(numbers)) for name, _ in gap.limits]
@@ -271,12 +297,12 @@ class Dae:
         return problems
 
     @cached_property
-    def _gaps(self) -> ca.Function:
-        """Width and limits of every gap as a function of the parameters."""
-        rows = [
-            e for a in self.automata for g in a.gaps for e in (g.width, *(limit for _, limit in g.limits))
-        ]
-        return ca.Function("gaps", [self.p], [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
+    def _together(self) -> ca.Function:
+        """What is tied to the parameters, then width and limits of every gap, as a function of them."""
+        gaps = [g for a in self.automata for g in a.gaps]
+        rows = [tied.value for tied in self.tied]
+        rows += [e for g in gaps for e in (g.width, *(limit for _, limit in g.limits))]
+        return ca.Function("together", [self.p], [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
 
 
 def _is_number(text: str) -> bool:

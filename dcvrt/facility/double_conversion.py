@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dcvrt.facility.site import site
+from dcvrt.facility.site import give_names, site
 from dcvrt.models import (
     ActivePriorityLimiter,
     Bess,
@@ -312,5 +312,4 @@ def _name_outputs(f: Diagram, **others: Port) -> None:
         "p_load": "load.demand", "p_out": "load.p", "p_it": "psu.p", "p_cool": "cooling.p",
         "mode": "sup.mode", "stored": "ledger.stored", "p_loss": "ledger.loss",
     }  # fmt: skip
-    for output, source in usual.items():
-        f.output(output, others.get(output) or f.port(source))
+    give_names(f, usual, others)

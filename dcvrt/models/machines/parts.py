@@ -29,6 +29,7 @@ class UnitBlock(Block):
     Time constants need not be named here: 0 always leaves out their state.
     """
 
+    optional_terms: ClassVar[bool] = True
     optional: ClassVar[tuple[str, ...]] = ()
     switches: ClassVar[tuple[str, ...]] = ()
     ordered: ClassVar[tuple[tuple[str, str], ...]] = ()
