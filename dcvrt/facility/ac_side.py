@@ -108,10 +108,10 @@ def standby_ups(f: Diagram, control: LineInteractiveControl | EcoModeControl) ->
 def name_outputs(f: Diagram, **others: Port) -> None:
     """Give the outputs that every variant has their names."""
     usual = {
-        "v_it": "supply.v_it", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag",
-        "i": "poi.drawn", "i_max": "bus.i_max",
+        "v_it": "supply.v_it", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i_max": "bus.i_max",
         "p_b": "battery.p", "soc": "battery.soc", "w_dc": "supply.e",
         "p_load": "demand.demand", "p_out": "load.p", "p_it": "supply.p", "p_cool": "others.cooling",
         "mode": "control.mode", "stored": "ledger.stored", "p_loss": "ledger.loss",
+        "i": "poi.drawn",
     }  # fmt: skip
     give_names(f, usual, others)
