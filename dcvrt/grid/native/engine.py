@@ -17,7 +17,7 @@ from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
 from dcvrt.grid.native.point import NativePoint, System, refuse_islands
 from dcvrt.grid.native.run import Options, Simulated
-from dcvrt.grid.native.steady import directions, loads
+from dcvrt.grid.native.steady import Flow, directions, loads
 from dcvrt.grid.native.structure import SCALE, Structure
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
@@ -125,7 +125,7 @@ class Engine:
     @cached_property
     def system(self) -> System:
         """Units and network, compiled."""
-        return System(self.network, groups(self.units), self.network.indices(self.sites))
+        return System(Flow(self.network), groups(self.units), self.network.indices(self.sites))
 
     def point(
         self,
@@ -173,9 +173,7 @@ class Engine:
         return NativePoint(system, load, changes, fed, sizes, self.rule, self.reactive_limits, where)
 
     def _system(self, devices: tuple[Group, ...], coupled: tuple[Group, ...]) -> System:
-        if not devices and not coupled:
-            return self.system
-        return System(self.network, (*self.system.groups, *devices), self.system.points, coupled)
+        return self.system.joined_by(devices, coupled) if devices or coupled else self.system
 
     def _devices(self, fed: Mapping[str, tuple[Phasors, Phasors]]) -> Iterable[Group]:
         """Loads and wind as units, one at each bus that has any."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,7 +37,8 @@ class System:
 
     Parameters
     ----------
-    network : Network
+    flow : Flow
+        Power flow of its network.
     groups : sequence of Group
     points : int array
         Positions of the buses whose voltage is asked for.
@@ -45,20 +46,24 @@ class System:
         Dynamic loads, one unit a site.
     """
 
-    network: Network
+    flow: Flow
     groups: tuple[Group, ...]
     points: Integers
     facilities: tuple[Group, ...] = ()
+
+    def joined_by(self, devices: tuple[Group, ...], facilities: tuple[Group, ...]) -> System:
+        """The same grid with more units."""
+        return replace(self, groups=(*self.groups, *devices), facilities=facilities)
+
+    @property
+    def network(self) -> Network:
+        """Buses, branches and generators."""
+        return self.flow.network
 
     @property
     def all_groups(self) -> tuple[Group, ...]:
         """Generating units, then facilities."""
         return (*self.groups, *self.facilities)
-
-    @cached_property
-    def flow(self) -> Flow:
-        """Power flow of the network."""
-        return Flow(self.network)
 
     @cached_property
     def layout(self) -> Layout:
