@@ -161,6 +161,6 @@ def start_flags(dae: Dae) -> np.ndarray:
 
 
 __all__ = [
-    "CASES", "controls", "functions", "power", "read_units", "start_flags", "state", "system", "values",
-    "voltage",
+    "CASES", "controls", "fresh", "functions", "place", "power", "read_units", "start_flags", "state",
+    "system", "values", "voltage",
 ]  # fmt: skip
