@@ -1,7 +1,7 @@
 """Generating units: synchronous machines, exciters, governors, stabilisers, one file per model."""
 
 from dcvrt.models.machines.esst3a import CompoundSource, Esst3aField, Esst3aRegulator, esst3a
-from dcvrt.models.machines.exdc2 import Exdc2, Ieeex1
+from dcvrt.models.machines.exdc2 import Exdc2, Ieeex1, Ieeex1BusFed
 from dcvrt.models.machines.exst1 import Exst1
 from dcvrt.models.machines.fixed import FixedField, FixedPower, NoStabiliser
 from dcvrt.models.machines.frequency import BusFrequency
@@ -33,6 +33,7 @@ __all__ = [
     "IeeestWithWindow",
     "Ieeet1",
     "Ieeex1",
+    "Ieeex1BusFed",
     "NoStabiliser",
     "Sexs",
     "St2Cut",

@@ -130,7 +130,7 @@ class Exdc2(UnitBlock):
 
 
 class Ieeex1(Exdc2):
-    r"""Excitation system of type 1 whose limits fall with the terminal voltage, IEEEX1.
+    r"""Excitation system of type 1 with a lead-lag, IEEEX1.
 
     .. math::
         T_R \dot v_m = |v| - v_m, \qquad u = V_{ref} + V_s - v_m - \frac{K_F}{T_F} (V_f - w), \qquad
@@ -138,10 +138,28 @@ class Ieeex1(Exdc2):
 
     .. math::
         T_A \dot v_r = K_A \Bigl(x + \frac{T_C}{T_B} (u - x)\Bigr) - v_r, \qquad
-        V_{Rmin} |v| \le v_r \le V_{Rmax} |v|
+        V_{Rmin} \le v_r \le V_{Rmax}
 
     .. math::
         T_E \dot V_f = v_r - K_E V_f - S_B [V_f - S_A]_+^2, \qquad T_F \dot w = V_f - w
+
+    Modes and time constants of 0 as in EXDC2, from which it differs in that V_f does not follow the speed.
+    Valid for direct-current exciters whose regulator has a supply of its own.
+    Equilibrium: v_m = |v|, w = V_f, v_r = K_E V_f + S_B [V_f - S_A]^2, x = v_r / K_A, V_ref = |v| + x.
+    Source: PSS/E's IEEEX1, and ANDES's as it computes: it declares limits that move with the voltage, and
+    runs with fixed ones. `Ieeex1BusFed` has those that move.
+    """
+
+    def field(self, s: Any) -> Any:
+        return s.e_f
+
+
+class Ieeex1BusFed(Ieeex1):
+    r"""IEEEX1 whose limits are in proportion to the terminal voltage, which feeds its regulator.
+
+    .. math::
+        T_A \dot v_r = K_A \Bigl(x + \frac{T_C}{T_B} (u - x)\Bigr) - v_r, \qquad
+        V_{Rmin} |v| \le v_r \le V_{Rmax} |v|
 
     | mode | output of the regulator |
     |---|---|
@@ -149,13 +167,13 @@ class Ieeex1(Exdc2):
     | UPPER | V_Rmax times the voltage, while more is asked for |
     | LOWER | V_Rmin times the voltage, while less is asked for |
 
-    On a limit the output moves with it, and the lag starts from where the limit is when it lets go. A limit
-    that rises at a stroke, as a fault is cleared, takes the output with it; in ANDES the lag has to catch up
-    first, which with T_A = 0.02 s and K_A u far beyond the limit takes a fraction of T_A.
-    Time constants of 0 as in EXDC2.
-    Valid for exciters whose regulator is fed from the terminals.
-    Equilibrium: v_m = |v|, w = V_f, v_r = K_E V_f + S_B [V_f - S_A]^2, x = v_r / K_A, V_ref = |v| + x.
-    Source: PSS/E's IEEEX1 as in ANDES.
+    All else as in IEEEX1. On a limit the output moves with it, and the lag starts from where the limit is
+    when it lets go; the state v_r means nothing meanwhile. A limit that rises at a stroke, as a fault is cleared,
+    takes the output with it; a lag that had to catch up first would need a fraction of T_A, as long as what
+    is asked for is far beyond the limit.
+    Valid for direct-current exciters whose regulator is fed from the terminals.
+    Equilibrium: as IEEEX1.
+    Source: IEEE Std 421.5, the limits of type DC2A.
     """
 
     def limits(self, s: Any) -> tuple[Any, Any]:
@@ -164,6 +182,3 @@ class Ieeex1(Exdc2):
 
     def output_of_regulator(self, s: Any) -> Any:
         return lag_value(s, s.v_r, *self.limits(s), self.is_off("T_A"))
-
-    def field(self, s: Any) -> Any:
-        return s.e_f

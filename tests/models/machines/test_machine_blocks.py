@@ -26,6 +26,7 @@ from dcvrt.models.machines import (
     IeeestWithWindow,
     Ieeet1,
     Ieeex1,
+    Ieeex1BusFed,
     NoStabiliser,
     Sexs,
     St2Cut,
@@ -76,6 +77,7 @@ FEEDTHROUGH = {
     Ieeet1: {"v_f": set()},
     Exdc2: {"v_f": {"omega"}},
     Ieeex1: {"v_f": set()},
+    Ieeex1BusFed: {"v_f": set()},
     Exst1: {"v_f": {"i_f"}},
     Esst3aRegulator: {"v_a": set()},
     CompoundSource: {"v_b": {"v", "i", "i_f"}},
@@ -297,8 +299,8 @@ def test_a_lead_lag_jumps_by_the_ratio_of_its_times():
     assert eq.der["e_f"] == approx(10 * (0.02 + 2 / 8 * 0.08) - 0.5)
 
 
-def test_limits_of_ieeex1_fall_with_the_voltage():
-    block = Ieeex1(V_Rmax=5.0)
+def test_limits_of_a_regulator_fed_from_the_bus_fall_with_the_voltage():
+    block = Ieeex1BusFed(V_Rmax=5.0)
     given = dict(v=Phasor(0.3, 0.4), v_s=0.0, omega=1.0, v_m=0.5, x=0.0, v_r=4.0, e_f=2.0, w=2.0)
     rate = [block.equations(block.at(mode=mode, **given)).der["e_f"] for mode in ("FREE", "UPPER", "LOWER")]
     assert rate == approx([4.0 - 2.0, 2.5 - 2.0, -3.65 - 2.0])

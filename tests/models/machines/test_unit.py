@@ -23,7 +23,7 @@ from dcvrt.models.machines import (
     Ieeest,
     IeeestWithWindow,
     Ieeet1,
-    Ieeex1,
+    Ieeex1BusFed,
     Sexs,
     St2Cut,
     Tgov1,
@@ -48,7 +48,7 @@ def zeros():
         "sexs": lambda: unit(GenRou(), Sexs(T_B=0.0, T_A=0.0, T_E=0.0), Tgov1(T_1=0.0, T_3=0.0, T_2=0.0)),
         "ieeet1": lambda: unit(GenRou(), Ieeet1(T_R=0.0, T_A=0.0), Tgov1N(), Ieeest(T_2=0.0, T_4=0.0)),
         "ieeex1": lambda: unit(
-            GenRou(), Ieeex1(T_R=0.0, T_B=0.0, T_C=0.0, T_A=0.0), Ieeeg1(T_1=0.0, T_4=0.0, T_7=0.0),
+            GenRou(), Ieeex1BusFed(T_R=0.0, T_B=0.0, T_C=0.0, T_A=0.0), Ieeeg1(T_1=0.0, T_4=0.0, T_7=0.0),
             IeeestWithWindow(signal=2.0, T_5=0.0, T_6=0.0, T_1=0.0, T_2=0.0, T_3=0.0, T_4=0.0),
         ),
         "exst1": lambda: unit(
@@ -344,7 +344,7 @@ def test_a_lower_limit_works_as_an_upper_one():
 
 
 def test_a_limit_that_moves_takes_the_output_with_it():
-    block = Ieeex1(
+    block = Ieeex1BusFed(
         T_R=0.0, T_B=0.0, T_C=0.0, K_A=10.0, T_A=0.1, V_Rmax=1.0, V_Rmin=-1.0, K_E=0.0, K_F=0.0, T_E=1.0,
         v_ref=1.05,
     )  # fmt: skip
