@@ -57,6 +57,11 @@ def package() -> Path:
 @cache
 def system(case: str) -> Any:
     """A case after power flow and initialisation."""
+    return fresh(case)
+
+
+def fresh(case: str, fault: int | None = None) -> Any:
+    """A case of one's own, with a fault device (switched off) on request."""
     if case == "ieee118":
         ss = andes.read(andes.case118())
         with andes.quiet():
@@ -65,8 +70,11 @@ def system(case: str) -> Any:
         path, dynamics = CASES[case]
         ss = andes.read(package() / path, package() / dynamics if dynamics else None)
     with andes.quiet():
+        if fault is not None:
+            ss.add("Fault", {"idx": "fault", "bus": fault, "tf": 1e3, "tc": 2e3, "xf": 1e-4, "rf": 0.0})
         ss.setup()
         ss.PFlow.run()
+        ss.TDS.config.no_tqdm = 1
         ss.TDS.init()
     return ss
 
@@ -153,6 +161,6 @@ def start_flags(dae: Dae) -> np.ndarray:
 
 
 __all__ = [
-    "CASES", "controls", "functions", "power", "read_units", "start_flags", "state", "system", "values",
-    "voltage",
+    "CASES", "controls", "fresh", "functions", "place", "power", "read_units", "start_flags", "state",
+    "system", "values", "voltage",
 ]  # fmt: skip

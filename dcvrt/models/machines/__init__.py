@@ -2,7 +2,7 @@
 
 from dcvrt.models.machines.converter import CurrentConverter
 from dcvrt.models.machines.esst3a import CompoundSource, Esst3aField, Esst3aRegulator, esst3a
-from dcvrt.models.machines.exdc2 import Exdc2, Ieeex1
+from dcvrt.models.machines.exdc2 import Exdc2, Ieeex1, Ieeex1BusFed
 from dcvrt.models.machines.exst1 import Exst1
 from dcvrt.models.machines.fixed import FixedField, FixedPower, NoStabiliser
 from dcvrt.models.machines.frequency import BusFrequency
@@ -37,6 +37,7 @@ __all__ = [
     "IeeestWithWindow",
     "Ieeet1",
     "Ieeex1",
+    "Ieeex1BusFed",
     "NoStabiliser",
     "Sexs",
     "St2Cut",
