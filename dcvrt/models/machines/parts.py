@@ -112,6 +112,11 @@ def lag_rows(
     return clip_rows(target, low, high) if at_once else windup_rows(state, x, target, low, high)
 
 
+def lag_value(s: Any, x: Scalar, low: Scalar, high: Scalar, at_once: bool) -> Scalar:
+    """What a lag gives whose limits move: its state, or the limit as it is now."""
+    return x if at_once else limited(s, x, low, high)
+
+
 def clip_rows(signal: Scalar, low: Scalar, high: Scalar) -> tuple[Go, ...]:
     """Rows of a signal without memory that is cut off at two limits."""
     return (
