@@ -16,7 +16,7 @@ from benchmarks.harness import Result, result
 from dcvrt.grid.network import Network
 from dcvrt.planning import HostingProblem, Row, profiles
 from dcvrt.planning import monolith as whole
-from dcvrt.planning.master import highs
+from dcvrt.planning.master import Master, highs
 
 SITES = (21, 75, 106, 108)
 SCALE = 0.6
@@ -39,7 +39,9 @@ def _against_monolith(network: Network, year: profiles.Year, voltage: tuple[floa
     start = time.perf_counter()
     plan = problem.solve()
     ours = time.perf_counter() - start
-    programme = whole.build(problem, np.arange(len(year)), (), np.zeros(len(SITES)))
+    programme = whole.build(
+        problem, np.arange(len(year)), Master(SITES, problem.lower, problem.upper, ()), np.zeros(len(SITES))
+    )
     solver = highs()
     solver.setOptionValue("solver", "simplex")
     solver.passModel(programme.highs_model())

@@ -208,7 +208,10 @@ def test_largest_size_binds_with_a_price_of_one() -> None:
         ("bound", bus, pytest.approx(1.0)) for bus in (106, 108, 21, 75)
     ]
     assert str(plan.binding[2]) == "bound largest size of site 21: 1 MW/MW"
-    assert list(plan.table().columns) == ["kind", "label", "hour", "bus", "price", "unit", "limit"]
+    assert list(plan.table().columns) == [
+        *("kind", "label", "hour", "bus", "price", "unit", "limit"),
+        *("outage", "fault", "mode", "target"),
+    ]
 
 
 def test_unit_limits_are_named_where_generation_is_short() -> None:
