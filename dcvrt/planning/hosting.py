@@ -59,7 +59,7 @@ class HostingProblem:
     rating_scale : float
         Factor on every branch rating.
     voltage : (float, float) or None
-        Limits at every `pq` bus in every hour, pu; None leaves voltages out.
+        Limits in every hour at every bus whose voltage can move, pu; None leaves voltages out.
     pf : float
         Power factor of the hosted load, lagging.
     h_max, min_size : float or mapping of bus number to float
@@ -72,6 +72,10 @@ class HostingProblem:
         must only not get worse; `plan.voltage.widened` counts them.
     security : N1, optional
         Outages that every hour must survive without redispatch. `plan.security` says what is covered.
+    reactive_limits : bool
+        Whether the AC power flow keeps units within their reactive limits, by switching buses between
+        holding their voltage and giving what they can. Without, voltages at generator buses are held
+        whatever that takes, and `check_ac` says how far beyond their limits units are.
     hull : bool
         Look at the corner hours of the convex hull of the operating parameters only, which is exact and
         quicker.
@@ -96,6 +100,7 @@ class HostingProblem:
         voltage_screen: str = "relinearised",
         base_violations: str = "error",
         security: N1 | None = None,
+        reactive_limits: bool = True,
         hull: bool = True,
     ) -> None:
         sites = tuple(sites)
@@ -117,7 +122,7 @@ class HostingProblem:
         self.sites, self.year, self.rating_scale = sites, hours, rating_scale
         self.voltage, self.pf, self.voltage_screen = voltage, pf, voltage_screen
         self.lower, self.upper = lower, upper
-        self.security = security
+        self.security, self.reactive_limits = security, reactive_limits
         self._base_violations, self._hull = base_violations, hull
         self._flow_cuts: list[FlowCut] = []
         self._voltage_keys: dict[tuple[int, int, int], None] = {}
@@ -135,7 +140,7 @@ class HostingProblem:
     @cached_property
     def ac(self) -> HostedFlow:
         """AC power flow of the hours at any capacities."""
-        return HostedFlow(self.network, self.sites, self.year, self.pf)
+        return HostedFlow(self.network, self.sites, self.year, self.pf, self.reactive_limits)
 
     @cached_property
     def screen(self) -> VoltageScreen | None:
@@ -276,7 +281,7 @@ class HostingProblem:
             agreement = None if screen is None else Agreement(screen, self.voltage_screen == "relinearised")
             settled = self._settle(master, chosen.open, floor, agreement)
             if settled is not None:
-                best = settled, hours.certificate, None if agreement is None else agreement.info(settled.H)
+                best = settled, hours.certificate, None if agreement is None else agreement.info()
             if not master.may_close:
                 break
         if best is None:
@@ -307,8 +312,13 @@ class HostingProblem:
         self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None
     ) -> Solution | None:
         """Optimum for given open sites, all hours certified; None when there is none above `floor`."""
+        restarted = False
         while True:
             solution = master.solve(is_open)
+            if solution is None and agreement is not None and not restarted:
+                restarted = True
+                if agreement.restart(np.where(is_open, master.lower, 0.0), master):
+                    continue
             if solution is None or solution.objective <= floor:
                 return None
             if agreement is not None:
@@ -407,7 +417,7 @@ def _all_open(count: int) -> Solution:
     """The choice when no site can profit from being closed."""
     nothing = np.zeros(0)
     every = np.ones(count, dtype=bool)
-    return Solution(np.zeros(count), nothing, every, np.inf, nothing, nothing, nothing, nothing)
+    return Solution(np.zeros(count), nothing, every, np.inf, (), nothing, nothing, nothing, nothing)
 
 
 def _tangent_cut(tangent: Tangent) -> Cut:

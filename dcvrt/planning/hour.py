@@ -8,13 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.grid.network import Network
-from dcvrt.planning.master import highs
+from dcvrt.planning.master import TOLERANCE, highs
 from dcvrt.planning.security import Outages
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 LINES_A_ROUND = 10
+STALLED = 1e-7
+"""Tolerance of the simplex method where it does not reach that of the master programme, MW."""
 INTACT = -1
 """In place of an outage: the network as it is."""
 
@@ -128,8 +130,6 @@ class HourDispatch:
         low, high : arrays (units,)
             Unit limits of the hour, MW.
         """
-        import highspy
-
         n = self._count
         fixed = self.network.flows(injection)
         demand = -injection.sum()
@@ -142,16 +142,30 @@ class HourDispatch:
                 np.r_[demand, np.full(count - 1, -self._inf)],
                 np.r_[demand, self._high - self._sign * self._after(fixed)],
             )
-            self._solver.run()
-            self.solved += 1
-            if self._solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-                status = self._solver.modelStatusToString(self._solver.getModelStatus())
-                raise RuntimeError(f"HiGHS ended the dispatch of an hour with {status}.")
+            self._run()
             solution = self._solver.getSolution()
             x = np.asarray(solution.col_value)
             if not self._add_violated(fixed + self.flows_of(x[:n]), x[n], tolerance):
                 break
         return Dispatched(float(x[n:].sum()), x[:n], self._dual(np.asarray(solution.row_dual)))
+
+    def _run(self) -> None:
+        """Run the simplex method; where it stalls short of its tolerances, again without the old basis, and
+        then to 1e-7 MW, still well within what a certificate lets pass. Cuts are made valid in any case."""
+        import highspy
+
+        for tolerance in (TOLERANCE, TOLERANCE, STALLED):
+            for kind in ("primal", "dual"):
+                self._solver.setOptionValue(f"{kind}_feasibility_tolerance", tolerance)
+            self._solver.run()
+            self.solved += 1
+            status = self._solver.getModelStatus()
+            if status == highspy.HighsModelStatus.kOptimal:
+                return
+            self._solver.clearSolver()
+        raise RuntimeError(
+            f"HiGHS ended the dispatch of an hour with {self._solver.modelStatusToString(status)}."
+        )
 
     def _after(self, flow: Floats) -> Floats:
         """Flow that each row looks at, for the branch flows before any outage."""

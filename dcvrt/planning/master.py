@@ -94,6 +94,8 @@ class Solution:
         Capacities in MW and converter ratings in MVA; S is empty where ratings are no unknowns.
     open : bool array (sites,)
     objective : float
+    cuts : tuple of Cut
+        Those that the optimum was found under.
     cut_price : array (cuts,)
     row_dual : array (rows,)
         Negative where the lower limit of a requirement row binds, positive where the upper one does.
@@ -105,6 +107,7 @@ class Solution:
     S: Floats
     open: Flags
     objective: float
+    cuts: tuple[Cut, ...]
     cut_price: Floats
     row_dual: Floats
     bound_price: Floats
@@ -225,6 +228,7 @@ class Master:
             values[n : n + self._rated],
             values[width:] > 0.5,
             objective,
+            (),
             nothing,
             nothing,
             nothing,
@@ -309,6 +313,7 @@ class Master:
             values[n : n + self._rated],
             is_open,
             objective,
+            tuple(self.cuts),
             dual[:count],
             row_dual,
             np.where(is_open & (high <= H), np.maximum(reduced[:n], 0.0), 0.0),

@@ -134,7 +134,9 @@ def build(problem: HostingProblem, hours: Integers, master: Master, point: Float
         )
         low.append(at_point.low)
         high.append(at_point.high)
-        row_names += [f"V_{bus}_h{t}" for t in year.hours[hours] for bus in network.bus[problem.screen.pq]]
+        row_names += [
+            f"V_{bus}_h{t}" for t in year.hours[hours] for bus in network.bus[problem.screen.moving]
+        ]
     free = np.full(n_bus, np.inf)
     free[network.slack] = 0.0
     units = network.generators
@@ -191,9 +193,9 @@ def _linearised(problem: HostingProblem, hours: Integers, point: Floats) -> _Vol
     """Voltage rows of the hours as `slope @ H` between bounds, hour by hour."""
     screen, ac = problem.screen, problem.ac
     assert screen is not None
-    v = ac.base[:, hours] if not point.any() else ac.solve(point, hours).require().v
-    slope = ac.flow.sensitivities(v, ac.change, problem.year.dc[hours])
-    constant = abs(v[screen.pq]) - slope @ point
+    solved = ac.solve(point, hours).require() if point.any() else ac.unhosted.take(hours)
+    slope = ac.slopes(solved, hours)
+    constant = abs(solved.v[screen.moving]) - slope @ point
     return _VoltageRows(
         slope.transpose(1, 0, 2).reshape(-1, len(point)),
         (screen.lower[:, hours] - constant).T.ravel(),

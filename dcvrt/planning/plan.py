@@ -145,18 +145,19 @@ class VoltageInfo:
     passes : int
         Linearisations after the first.
     guard_pu : float
-        Widest guard band of a bus: hours in which the screen puts a voltage within its bus's band of a
-        limit were solved by AC power flow.
+        Guard band: hours in which a voltage was expected closer to a limit were solved by AC power flow.
     checked : int
-        Number of these hours, with the worst hour of each bus; with `one-shot` only the latter.
+        Number of hours solved, with the sample that the expectation rests on and the worst hour of each bus;
+        with `one-shot` only the latter.
     v_error_pu : float
-        Largest difference between AC power flow and screen among the voltages within their guard bands.
+        Largest difference between AC power flow and screen among the voltages within 5e-4 pu of a limit;
+        in hours that were not solved, between what is expected and the screen.
     v_min_pu, v_max_pu : float
-        Extremes of the AC voltages at `pq` buses in them.
+        Extremes of the AC voltages in them, at all buses whose voltage can move.
     widened : int
         Bus-hours outside the limits with nothing hosted, which must only not get worse.
     room : array (hours,)
-        Least distance of a voltage to its limit in each hour as the screen has it, pu.
+        Least distance of a voltage to its limit in each hour as the screen has it, pu, at most 0.01.
     """
 
     screen: str
@@ -223,9 +224,9 @@ class AcVerdict:
     Parameters
     ----------
     passed : bool
-        Solved in every hour, with every `pq` voltage within the limits.
+        Solved in every hour, with every voltage that can move within the limits.
     v_min_pu, v_max_pu : float
-        Extremes over `pq` buses and hours that have a solution.
+        Extremes over these voltages and the hours that have a solution.
     v_error_pu : float
         Largest difference between AC and linear screen of the least distance to a limit, over the hours in
         which either puts it below 5e-4 pu; elsewhere no limit is near and the screen may be cruder.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.planning.agreement import GUARD
+from dcvrt.planning.agreement import NEAR
 from dcvrt.planning.certificate import TOLERANCE_MW, Hours
 from dcvrt.planning.hour import INTACT, FlowCut
 from dcvrt.planning.master import Master, Solution
@@ -75,7 +75,7 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
         more = found[key].price if key in found else 0.0
         found[key] = Binding(**{**vars(binding), "price": binding.price + more})
 
-    for cut, price in zip(master.cuts, solution.cut_price, strict=True):
+    for cut, price in zip(solution.cuts, solution.cut_price, strict=True):
         if price <= NO_PRICE:
             continue
         if isinstance(cut.origin, FlowCut):
@@ -84,7 +84,7 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
         elif isinstance(cut.origin, Tangent):
             t, screen = cut.origin, problem.screen
             assert screen is not None
-            bus = int(problem.network.bus[screen.pq[t.bus]])
+            bus = int(problem.network.bus[screen.moving[t.bus]])
             side = "at least" if t.side < 0 else "at most"
             add(
                 Binding(
@@ -215,9 +215,9 @@ def _alone(master: Master, i: int) -> float:
 def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
     """Judge a plan by AC power flow in every hour."""
     solved = problem.ac.solve(H)
-    pq = problem.ac.flow.pq
+    moving = problem.ac.flow.moving
     good = np.flatnonzero(solved.converged)
-    size = abs(solved.v[np.ix_(pq, good)])
+    size = abs(solved.v[np.ix_(moving, good)])
     screen = problem.screen
     if screen is None:
         low, high = np.zeros(size.shape), np.full(size.shape, np.inf)
@@ -227,11 +227,11 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         return AcVerdict(False, np.nan, np.nan, np.nan, None, None, solved.status)
     room = np.minimum(size - low, high - size)
     row, k = np.unravel_index(room.argmin(), room.shape)
-    hour, bus = int(problem.year.hours[good[k]]), int(problem.network.bus[pq[row]])
+    hour, bus = int(problem.year.hours[good[k]]), int(problem.network.bus[moving[row]])
     error = np.nan
     if found.voltage is not None:
         true, linear = room.min(axis=0), found.voltage.room[good]
-        error = float(abs(true - linear)[np.minimum(true, linear) < GUARD].max(initial=0.0))
+        error = float(abs(true - linear)[np.minimum(true, linear) < NEAR].max(initial=0.0))
     inside = bool(room[row, k] >= -AC_TOLERANCE)
     if not solved.converged.all():
         status = solved.status

@@ -21,7 +21,7 @@ YEAR = profiles.ieee118().window(range(8424, 8448))
 
 @pytest.fixture(scope="module")
 def problem() -> HostingProblem:
-    return HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+    return HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, reactive_limits=False)
 
 
 def margin(site: int, intercept: float, slope: float, label: str = "") -> Row:
@@ -287,7 +287,7 @@ def test_base_case_without_enough_units_says_so() -> None:
 
 def test_voltages_outside_the_limits_before_hosting_are_named() -> None:
     with pytest.raises(InfeasibleError) as error:
-        HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06)).solve()
+        HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06), reactive_limits=False).solve()
     lines = str(error.value).splitlines()
     assert lines[0] == "ieee118: with nothing hosted 3 bus(es) are outside the voltage limits 0.95-1.06 pu."
     assert lines[1] == "  bus 53: outside in 14 hours, worst 0.9459 pu in hour 8441"
