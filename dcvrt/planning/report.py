@@ -277,7 +277,7 @@ def base_case(hours: Hours, rating_scale: float) -> str:
         at = int(todo[0])
         found = hours.dispatch(nothing, at)
         spent += 1
-        if found.shortfall > TOLERANCE_MW:
+        if found.cut is not None and found.shortfall > TOLERANCE_MW:
             if worst is None or found.shortfall > worst[0]:
                 worst = found.shortfall, at, found.cut
             least = hours.shortfall(found.cut, todo)
