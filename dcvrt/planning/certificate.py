@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +19,8 @@ Flags = npt.NDArray[np.bool_]
 
 TOLERANCE_MW = 1e-6
 KNOWN_DISPATCHES = 60
+IDLE = 10
+"""Known dispatches in a row that serve no hour before programmes are solved."""
 BLOCK = 2_000_000
 """Flows looked at together, so that large networks stay small in memory."""
 HULL_FROM = 400
@@ -101,7 +105,7 @@ class Hours:
         low, high = self.unit_ranges.limits(self.corners)
         room = (high - low).sum(axis=0).mean()
         share = (self._demand.mean() - low.sum(axis=0).mean()) / max(room, 1e-9)
-        self._known = [np.full(len(network.generators), float(np.clip(share, 0.0, 1.0)))]
+        self._known = [_Known(np.full(len(network.generators), float(np.clip(share, 0.0, 1.0))))]
         self._watched = np.zeros(0, dtype=np.int64)
         self._failed: dict[int, None] = {}
         self.certificate = Certificate(0, 0, 0, TOLERANCE_MW)
@@ -146,11 +150,16 @@ class Hours:
         """Show that every hour has a dispatch at `H`, or return a cut that `H` violates."""
         todo = np.arange(len(self.corners))
         scaled = programme = 0
-        for share in reversed(self._known):
-            served = self._serves(share, H, todo)
+        idle = 0
+        for known in reversed(self._known.copy()):
+            served = self._serves(known, H, todo)
+            idle = 0 if served.any() else idle + 1
+            if served.any():  # to the front of the next search
+                self._known.remove(known)
+                self._known.append(known)
             scaled += int(served.sum())
             todo = todo[~served]
-            if not len(todo):
+            if not len(todo) or idle > IDLE:
                 break
         todo = todo[np.argsort(-self._demand[todo] - H.sum() * self._dc[todo], kind="stable")]
         suspect = np.isin(todo, list(self._failed))
@@ -158,38 +167,40 @@ class Hours:
         while len(todo):
             first, todo = int(todo[0]), todo[1:]
             found = self.dispatch(H, int(self.corners[first]))
-            share = self._remember(found.units, int(self.corners[first]))
+            known = self._remember(found.units, int(self.corners[first]))
             if found.shortfall > TOLERANCE_MW:
                 assert found.cut is not None
                 self._failed[first] = None
                 return found.cut
             programme += 1
-            served = self._serves(share, H, todo)
+            served = self._serves(known, H, todo)
             scaled += int(served.sum())
             todo = todo[~served]
         combination = len(self.year) - len(self.corners)
         self.certificate = Certificate(scaled, programme, combination, TOLERANCE_MW)
         return None
 
-    def _remember(self, units: Floats, hour: int) -> Floats:
+    def _remember(self, units: Floats, hour: int) -> _Known:
         """Keep a dispatch as the share that each unit gives of its range in the hour."""
         low, high = self.unit_limits(hour)
-        share = (units - low) / np.where(high > low, high - low, np.inf)
-        self._known = [*self._known, share][-KNOWN_DISPATCHES:]
-        return share
+        known = _Known((units - low) / np.where(high > low, high - low, np.inf))
+        self._known = [*self._known, known][-KNOWN_DISPATCHES:]
+        return known
 
-    def _serves(self, share: Floats, H: Floats, at: Integers) -> Flags:
+    def _serves(self, known: _Known, H: Floats, at: Integers) -> Flags:
         """Corner hours that units at `share` of their ranges serve, after all were moved by one share of
         their room up or down so that the hour balances."""
         good = np.zeros(len(at), dtype=bool)
         if not len(at):
             return good
         low, high = self.unit_ranges.limits(self.corners[at], compact=True)
-        units = low + share[:, None] * (high - low)
+        units = low + known.share[:, None] * (high - low)
         short = self._demand[at] + H.sum() * self._dc[at] - units.sum(axis=0)
         up = np.maximum(short, 0.0) / np.maximum((high - units).sum(axis=0), 1e-9)
         down = np.minimum(short, 0.0) / np.maximum((units - low).sum(axis=0), 1e-9)
-        flows = [self.unit_ranges.flows(part) for part in (units, high - units, units - low)]
+        if known.flows is None or not self.unit_ranges.constant:
+            known.flows = [self.unit_ranges.flows(part) for part in (units, high - units, units - low)]
+        flows = known.flows
         site = self._site_flow @ H
 
         def within(rows: Integers | slice, hours: Integers) -> tuple[Flags, Floats]:
@@ -215,6 +226,22 @@ class Hours:
         return good
 
 
+@dataclass(eq=False)
+class _Known:
+    """A dispatch that may serve other hours too.
+
+    Attributes
+    ----------
+    share : array (units,)
+        What each unit gives of its range.
+    flows : list of arrays or None
+        Branch flows of the outputs, of the room above and of the room below; kept while no limit varies.
+    """
+
+    share: Floats
+    flows: list[Floats] | None = None
+
+
 class UnitRanges:
     """Limits of the units hour by hour, and the branch flows of their outputs.
 
@@ -235,6 +262,11 @@ class UnitRanges:
         injection = np.zeros((len(network.bus), len(self._varying)))
         injection[network.generator_index[self._varying], np.arange(len(self._varying))] = 1.0
         self._columns = network.transfer(injection)
+
+    @property
+    def constant(self) -> bool:
+        """Whether no limit varies."""
+        return not len(self._varying)
 
     def limits(self, hours: Integers, compact: bool = False) -> tuple[Floats, Floats]:
         """Lower and upper limits at the given positions, MW, (units, hours).

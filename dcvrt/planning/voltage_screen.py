@@ -19,6 +19,10 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+BUSES_A_ROUND = 4
+"""Buses whose violated limits become cuts together."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tangent:
     """One voltage as an affine function of the capacities: `constant + slope @ H` against a limit.
@@ -149,7 +153,10 @@ class VoltageScreen:
         self.constant = size.copy()
         self.lower = np.minimum(limits[0], size)
         self.upper = np.maximum(limits[1], size)
-        self._note_ranges()
+        # Extremes over the hours, from which `near` bounds voltages for H >= 0.
+        self._constant_range = self.constant.min(axis=1), self.constant.max(axis=1)
+        self._slope_range = self.slope.min(axis=1), self.slope.max(axis=1)
+        self._tightest = self.lower.max(axis=1), self.upper.min(axis=1)
         outside = (size < limits[0]) | (size > limits[1])
         self.widened = int(outside.sum())
         if base_violations == "error":
@@ -192,11 +199,16 @@ class VoltageScreen:
         most = self._constant_range[1] + self._slope_range[1] @ H
         return np.flatnonzero((least < self._tightest[0] + margin) | (most > self._tightest[1] - margin))
 
-    def _note_ranges(self) -> None:
-        """Extremes over the hours, from which `near` bounds voltages for H >= 0."""
-        self._constant_range = self.constant.min(axis=1), self.constant.max(axis=1)
-        self._slope_range = self.slope.min(axis=1), self.slope.max(axis=1)
-        self._tightest = self.lower.max(axis=1), self.upper.min(axis=1)
+    def _widen_ranges(self, hours: Integers, rows: Integers | None = None) -> None:
+        """Take what changed in some hours, and in all hours of some rows, into the extremes."""
+        for values, (least, most) in (
+            (self.constant, self._constant_range),
+            (self.slope, self._slope_range),
+        ):
+            np.minimum(least, values[:, hours].min(axis=1), out=least)
+            np.maximum(most, values[:, hours].max(axis=1), out=most)
+            if rows is not None:
+                least[rows], most[rows] = values[rows].min(axis=1), values[rows].max(axis=1)
 
     def voltages(self, H: Floats, rows: Integers | None = None) -> Floats:
         """Linear voltages in all hours, of all moving buses or of some rows of them, pu."""
@@ -207,7 +219,8 @@ class VoltageScreen:
 
     def room(self, voltage: Floats, rows: Integers, hours: Integers | slice = slice(None)) -> Floats:
         """Distance of voltages, (rows, hours), to the nearer limit, pu; negative beyond it."""
-        low, high = self.lower[rows][:, hours], self.upper[rows][:, hours]
+        at = (rows, slice(None)) if isinstance(hours, slice) else np.ix_(rows, hours)
+        low, high = self.lower[at], self.upper[at]
         return np.minimum(voltage - low, high - voltage)
 
     def tangent(self, bus: int, hour: int, side: int) -> Tangent:
@@ -218,16 +231,18 @@ class VoltageScreen:
         )
 
     def violated(self, H: Floats, tolerance: float) -> list[Tangent]:
-        """The most violated lower and the most violated upper limit."""
+        """The most violated lower and upper limit of each of the buses with the worst."""
         rows = self.near(H, 0.0)
         if not len(rows):
             return []
         now = self.voltages(H, rows)
         found = []
         for side, over in ((-1, self.lower[rows] - now), (1, now - self.upper[rows])):
-            k, hour = divmod(int(over.argmax()), over.shape[1])
-            if over[k, hour] > tolerance:
-                found.append(self.tangent(int(rows[k]), hour, side))
+            hour = over.argmax(axis=1)
+            worst = over[np.arange(len(rows)), hour]
+            for k in np.argsort(-worst, kind="stable")[:BUSES_A_ROUND].tolist():
+                if worst[k] > tolerance:
+                    found.append(self.tangent(int(rows[k]), int(hour[k]), side))
         return found
 
     def relinearise(
@@ -254,4 +269,4 @@ class VoltageScreen:
         chosen = hours[steep]
         self.slope[:, chosen] = self.ac.slopes(solved.take(steep), chosen)
         self.constant[:, hours] = self.sizes(solved) - self.slope[:, hours] @ H
-        self._note_ranges()
+        self._widen_ranges(hours, rows if expected is not None else None)
