@@ -31,6 +31,7 @@ SITES = (21, 75, 106, 108)
 SCALE = 0.6
 LIMITS = (0.94, 1.06)
 LARGE = ("case300_ieee", "case1354_pegase", "case2869_pegase", "case9241_pegase")
+WITH_VOLTAGES = "case1354_pegase"
 RANDOM_CASES = 16
 
 
@@ -239,14 +240,41 @@ def large(smoke: bool) -> list[Result]:
     for name in LARGE:
         network = Network.from_matpower(Path(spec.origin).parent / "opf" / f"pglib_opf_{name}.m")
         rows += _large(network, profiles.ieee118({}))
+        if name == WITH_VOLTAGES:
+            rows += _large_with_voltages(network, profiles.ieee118({}).window(range(8400, 8448)))
     return rows
+
+
+def _sites_of(network: Network) -> tuple[int, ...]:
+    """Twenty of the 200 largest loads."""
+    rng = np.random.default_rng(1)
+    loads = np.argsort(-network.p_load, kind="stable")[:200]
+    return tuple(int(network.bus[k]) for k in np.sort(rng.choice(loads, 20, replace=False)))
+
+
+def _large_with_voltages(network: Network, year: profiles.Year) -> list[Result]:
+    """Voltage limits too, which must not get worse where nothing hosted breaks them already."""
+    problem = HostingProblem(
+        network,
+        _sites_of(network),
+        year,
+        1.0,
+        (0.9, 1.1),
+        h_max=1000.0,
+        base_violations="hold",
+        reactive_limits=False,
+    )
+    seconds, plan = _timed(problem.solve)
+    verdict = problem.check_ac(plan)
+    if not verdict.passed or "voltage" not in {b.kind for b in plan.binding}:
+        raise RuntimeError(f"{network.name}: no voltage binds, or AC power flow refuses. {verdict.status}")
+    case = f"{len(network.bus)} buses, 20 sites, {len(year)} h, lines and voltages bind"
+    return [result(case, "base, solve, agreed with AC", seconds, "s", error=verdict.v_error_pu)]
 
 
 def _large(network: Network, year: profiles.Year) -> list[Result]:
     """One network: sites at 20 of its 200 largest loads, hours of the year in which its dispatch exists."""
-    rng = np.random.default_rng(1)
-    loads = np.argsort(-network.p_load, kind="stable")[:200]
-    sites = tuple(int(network.bus[k]) for k in np.sort(rng.choice(loads, 20, replace=False)))
+    sites = _sites_of(network)
     lightest = network.generators.p_min.sum() / network.p_load.sum()
     year = year.window(year.hours[year.load > max(lightest, 0.6)])
     problem = HostingProblem(network, sites, year, 1.0, None, h_max=1000.0)
