@@ -149,7 +149,7 @@ class Agreement:
         self.least_room = np.minimum(room.min(axis=0, initial=MARGIN), MARGIN)
         worst = room.argmin(axis=1)
         if not self.repeat:  # a sample is enough to tell how wrong the screen is
-            hours = np.unique(np.r_[worst, self.screen.interpolation.sample[:1]])
+            hours = np.array([int(self.least_room.argmin())])
             solved = screen.ac.solve(H, hours).require()
             size = screen.sizes(solved)[rows]
             self.error = _error(screen, rows, hours, size, linear[:, hours])

@@ -148,7 +148,7 @@ class VoltageInfo:
         Guard band: hours in which a voltage was expected closer to a limit were solved by AC power flow.
     checked : int
         Number of hours solved, with the sample that the expectation rests on and the worst hour of each bus;
-        with `one-shot` only the latter.
+        with `one-shot` the hour with the least room alone.
     v_error_pu : float
         Largest difference between AC power flow and screen among the voltages within 5e-4 pu of a limit;
         in hours that were not solved, between what is expected and the screen.
