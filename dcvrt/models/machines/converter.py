@@ -32,7 +32,7 @@ class CurrentConverter(UnitBlock):
     T_i = Parameter(0.02, "s", (1e-3, 1.0), "lag of the current control", OWN)
     k_max = Parameter(1.1, "1", (1.0, 3.0), "largest current over the power at rest", OWN)
     V_floor = Parameter(0.1, "pu(V)", (1e-3, 0.9), "least voltage that currents are computed with", OWN)
-    eps = Parameter(1e-6, "pu(I)", (1e-12, 1e-2), "rounding of limits", "own choice: numerics")
+    eps = Parameter(1e-4, "pu(I)", (1e-12, 1e-2), "rounding of limits", "own choice: numerics")
 
     v = Input("pu(V)", "terminal voltage, network frame", kind=Phasor)
     i = Output("pu(I)", "current INTO the network, generator convention", kind=Phasor)

@@ -48,6 +48,7 @@ class ExponentialLoad(StaticLoad):
 
     Below v_low it is the impedance that it is there: :math:`P = P_0\, v_{low}^{\alpha} (m / v_{low})^2`.
     Exponent 2 is an impedance, 1 a current, 0 a power. Generator convention: the current is negative.
+    Equilibrium: none of its own, it has no state.
     Source: IEEE Task Force on Load Representation, IEEE Trans. Power Syst. 10 (1995) 1302-1313.
     """
 
@@ -66,6 +67,7 @@ class ZipLoad(StaticLoad):
         \qquad m = |v|
 
     Below v_low it is the impedance that it is there. Generator convention: the current is negative.
+    Equilibrium: none of its own, it has no state.
     Source: IEEE Task Force on Load Representation, IEEE Trans. Power Syst. 10 (1995) 1302-1313.
     """
 

@@ -9,9 +9,11 @@ import numpy as np
 from dcvrt.models.machines import (
     BusFrequency,
     CompoundSource,
+    CurrentConverter,
     Esst3aField,
     Esst3aRegulator,
     Exdc2,
+    ExponentialLoad,
     Exst1,
     FixedField,
     FixedPower,
@@ -28,6 +30,7 @@ from dcvrt.models.machines import (
     St2Cut,
     Tgov1,
     Tgov1N,
+    ZipLoad,
 )
 
 FORMS = [
@@ -36,6 +39,9 @@ FORMS = [
     (GenRou, dict(r_a=0.01, x_q2=0.3)),
     (GenRou, dict(x_q2=0.3, S_A=0.7, S_B=0.4)),
     (GenCls, dict(r_a=0.02)),
+    (ExponentialLoad, dict(p_0=0.9, q_0=0.4, alpha=1.3, beta=2.4)),
+    (ZipLoad, dict(p_0=0.9, q_0=0.4, a_z=0.3, a_i=0.3, b_z=0.5, b_i=0.1)),
+    (CurrentConverter, dict(p_0=0.8, q_0=-0.2)),
     (FixedField, {}),
     (FixedPower, {}),
     (NoStabiliser, {}),

@@ -13,9 +13,11 @@ from dcvrt.models import Block, Input, Parameter, Phasor, machines
 from dcvrt.models.machines import (
     BusFrequency,
     CompoundSource,
+    CurrentConverter,
     Esst3aField,
     Esst3aRegulator,
     Exdc2,
+    ExponentialLoad,
     Exst1,
     FixedField,
     FixedPower,
@@ -32,6 +34,7 @@ from dcvrt.models.machines import (
     St2Cut,
     Tgov1,
     Tgov1N,
+    ZipLoad,
     quadratic,
 )
 from dcvrt.models.testing import assert_consistent
@@ -69,6 +72,9 @@ def test_every_symbol_is_documented(kind):
 FEEDTHROUGH = {
     GenRou: {"i": {"v"}, "t_e": {"v"}, "i_f": {"v"}},
     GenCls: {"i": {"v", "v_f"}, "t_e": {"v", "v_f"}, "i_f": {"v_f"}},
+    ExponentialLoad: {"i": {"v"}},
+    ZipLoad: {"i": {"v"}},
+    CurrentConverter: {"i": set()},
     FixedField: {"v_f": set()},
     FixedPower: {"t_m": set(), "p_set": set()},
     NoStabiliser: {"v_s": set()},
@@ -441,3 +447,46 @@ def test_inputs_are_fed_by_name_in_a_unit():
             assert name in {
                 "v", "i", "delta", "omega", "t_e", "i_f", "v_f", "t_m", "p_set", "v_s", "f", "v_a", "v_b",
             }  # fmt: skip
+
+
+# -- loads and converters ------------------------------------------------------------------------------------
+
+
+def power(block, v):
+    """Power into the network at a terminal voltage."""
+    return complex(v * block.equations(block.at(v=v)).out["i"].conj())
+
+
+@pytest.mark.parametrize("m", [0.3, 0.69, 0.71, 0.95, 1.1])
+def test_loads_take_what_their_forms_say(m):
+    v = Phasor.polar(m, 0.4)
+    held = max(m, 0.7)
+    below = (m / held) ** 2
+    exponential = ExponentialLoad(p_0=0.9, q_0=0.4, alpha=1.3, beta=2.4)
+    assert power(exponential, v) == approx(-(0.9 * held**1.3 + 0.4j * held**2.4) * below)
+    mixed = ZipLoad(p_0=0.9, q_0=0.4, a_z=0.3, a_i=0.3, b_z=0.5, b_i=0.1)
+    shape = 0.9 * (0.3 * held**2 + 0.3 * held + 0.4) + 0.4j * (0.5 * held**2 + 0.1 * held + 0.4)
+    assert power(mixed, v) == approx(-shape * below)
+
+
+def test_exponents_two_one_and_zero_are_impedance_current_and_power():
+    v = Phasor.polar(0.9, -0.2)
+    for exponent, parts in ((2.0, (1.0, 0.0)), (1.0, (0.0, 1.0)), (0.0, (0.0, 0.0))):
+        a = ExponentialLoad(p_0=0.9, q_0=0.4, alpha=exponent, beta=exponent)
+        b = ZipLoad(p_0=0.9, q_0=0.4, a_z=parts[0], a_i=parts[1], b_z=parts[0], b_i=parts[1])
+        assert power(a, v) == approx(power(b, v))
+
+
+def test_the_converter_rests_at_its_power_and_is_limited_in_a_sag():
+    block = CurrentConverter(p_0=0.8, q_0=-0.2, k_max=1.1)
+    v = Phasor.polar(1.02, 0.3)
+    i = Phasor(0.8, 0.2) * v / v.abs2()
+    eq = block.equations(block.at(v=v, i_re=i.re, i_im=i.im))
+    assert abs(eq.der["i_re"]) < 1e-3
+    assert abs(eq.der["i_im"]) < 1e-3
+    low = Phasor.polar(0.4, -0.1)  # what would be asked for is twice what the limit grants
+    rate = block.equations(block.at(v=low, i_re=0.0, i_im=0.0)).der
+    granted = Phasor(rate["i_re"] * block.T_i, rate["i_im"] * block.T_i)
+    size = sqrt(0.8**2 + 0.2**2)
+    assert sqrt(granted.abs2()) == approx(1.1 * size, rel=1e-4)
+    assert complex(low * granted.conj()).real == approx(0.4 * 1.1 * size, rel=1e-3)  # all of it active

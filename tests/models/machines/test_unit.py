@@ -171,8 +171,8 @@ def test_errors_say_what_to_do():
         setpoints(d.compile())
     assert str(failure.value) == (
         "mine: not the system of one unit: it has 0 set-points of the field (exciter.v_ref, "
-        "exciter.regulator.v_ref, exciter.v_f0) and 0 of the power (governor.p_ref). Compile what "
-        "machines.unit() returned."
+        "exciter.regulator.v_ref, exciter.v_f0, device.p_0) and 0 of the power (governor.p_ref, device.q_0). "
+        "Compile what machines.unit() returned."
     )
     with pytest.raises(InputError) as failure:
         structure(d)
