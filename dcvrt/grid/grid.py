@@ -398,7 +398,7 @@ class Grid:
                 if not isinstance(fault, BusFault)
             ]
         else:
-            problems += _problems(thetas, wrt, self.sites, self.network)
+            problems += self._problems(thetas, wrt, self.sites, self.network)
         if facilities and engine == "andes":
             problems.append("facilities: ANDES has no model of them. Way out: engine='native'.")
         problems += [
@@ -418,7 +418,7 @@ class Grid:
             events = fault.events if isinstance(fault, FaultSequence) else (fault,)
             for event in events:
                 if isinstance(event, LineTrip):
-                    problems += _problems(branch, self.network, event.from_bus, event.to_bus)
+                    problems += self._problems(branch, self.network, event.from_bus, event.to_bus)
                     continue
                 problems += [f"fault: {line}" for line in self._unknown([event.bus])]
                 if event.bus in self.sites:
@@ -438,11 +438,11 @@ class Grid:
             problems.append(f"step = {step} s must be above 0 and at most 0.05 s.")
         raise_all(problems, self.name)
 
-
-def _problems(check: Callable[..., object], *given: object) -> list[str]:
-    """What a check that raises `InputError` says, as a list."""
-    try:
-        check(*given)
-    except InputError as error:
-        return [str(error)]
-    return []
+    def _problems(self, check: Callable[..., object], *given: object) -> list[str]:
+        """What a check that raises `InputError` says, as a list without the name of the grid."""
+        try:
+            check(*given)
+        except InputError as error:
+            first, *others = str(error).splitlines()
+            return [line.strip() for line in others] or [first.removeprefix(f"{self.network.name}: ")]
+        return []

@@ -17,7 +17,7 @@ import pytest
 import scipy.sparse as sp
 
 from dcvrt.errors import InputError, SimulationError
-from dcvrt.grid import BusFault, Grid, Period
+from dcvrt.grid import BusFault, Grid, LineTrip, Period
 from dcvrt.grid.andes import quiet
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.screening import retained_voltage
@@ -67,7 +67,7 @@ def test_one_fault_from_power_flow_to_waveforms(grid: Grid) -> None:
     assert point.residual < 1e-6
     assert power_flow_mismatch(grid, point, NO_VRT, period) < 1e-3
 
-    runs = grid.waveforms_of(NO_VRT, period, [fault], until=0.3)
+    runs = grid.waveforms_of(NO_VRT, period, [fault], until=0.3, engine="andes")
     run = runs[fault]
     assert run.completed
     assert run.status == "ieee118, windy, fault at bus 77, 100 ms: completed."
@@ -122,7 +122,7 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
         "  fault at bus 75: it is a candidate site, and no site rides through a fault at its own bus. "
         "Way out: a fault at a neighbouring bus.",
         "  fault: no bus 230.",
-        "  fault at bus 23: until = 1.05 s ends before it is cleared at 1.1 s.",
+        "  fault at bus 23, 100 ms: until = 1.05 s ends before it is cleared at 1.1 s.",
     ]
     assert text.count(" Did you mean ") == 2  # for the two bus numbers with a zero too many
 
@@ -131,28 +131,32 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
     ("arguments", "message"),
     [
         (
-            {"engine": "native"},
-            "ieee118: engine = 'native' is not available: the only engine so far is 'andes'.",
+            {"engine": "ands"},
+            "ieee118: engine = 'ands' is not known. Did you mean 'andes'? Known: native, andes.",
         ),
         (
-            {"wrt": ("H",)},
-            "ieee118: wrt: ANDES gives no derivatives; waveforms with tangents need the native engine, "
-            "which does not "
-            "exist yet. Way out: leave wrt out and take differences of two runs.",
+            {"engine": "andes", "wrt": ("H",)},
+            "ieee118: wrt: ANDES gives no derivatives. Way out: engine='native'.",
         ),
         (
-            {"facilities": {75: object()}},
-            "ieee118: facilities: coupling them into the network needs the native engine, which does not "
-            "exist yet. "
-            "Way out: run each facility on the waveform that this call returns without facilities=.",
+            {"engine": "andes", "facilities": {75: object()}},
+            "ieee118: facilities: ANDES has no model of them. Way out: engine='native'.",
         ),
         ({"step": 0.5}, "ieee118: step = 0.5 s must be above 0 and at most 0.05 s."),
     ],
 )
-def test_what_is_not_there_yet(grid: Grid, arguments: dict[str, object], message: str) -> None:
+def test_what_andes_does_not_give(grid: Grid, arguments: dict[str, object], message: str) -> None:
     with pytest.raises(InputError) as failure:
         grid.waveforms(NO_VRT, BusFault(23), **arguments)  # type: ignore[arg-type]
     assert str(failure.value) == message
+
+
+def test_andes_takes_bus_faults_only(grid: Grid) -> None:
+    with pytest.raises(InputError) as failure:
+        grid.waveforms(NO_VRT, LineTrip(23, 24), engine="andes")
+    assert str(failure.value) == (
+        "ieee118: fault line 23-24: engine='andes' takes bus faults only. Way out: engine='native'."
+    )
 
 
 @pytest.mark.parametrize(
@@ -227,7 +231,7 @@ class TestEveryOperatingPoint:
         assert np.delete(modes, angle_reference).real.max() < -0.01
 
     def test_chosen_faults_survive(self, grid: Grid, period: Period, hosting: dict[int, float]) -> None:
-        runs = grid.waveforms_of(hosting, period, [BusFault(bus) for bus in CHOSEN])
+        runs = grid.waveforms_of(hosting, period, [BusFault(bus) for bus in CHOSEN], engine="andes")
         for run in runs.values():
             assert run.completed, run.status
             for w in run.waveforms.values():
@@ -260,7 +264,7 @@ def own_loop(
 def test_agrees_with_the_loop_of_andes(grid: Grid, bus: int) -> None:
     fault, until = BusFault(bus, start=0.5, clear=0.1), 2.5
     t, reference = own_loop(grid, fault, until)
-    ours = grid.waveforms(NO_VRT, fault, until=until, step=1 / 480)
+    ours = grid.waveforms(NO_VRT, fault, until=until, step=1 / 480, engine="andes")
     error = np.abs(np.stack([ours[site].at(t) for site in SITES], axis=1) - reference).max(axis=1)
     away = (np.abs(t - fault.start) > 1e-3) & (np.abs(t - fault.cleared_at) > 1e-3)
     during = (t > fault.start) & (t < fault.cleared_at)
@@ -273,7 +277,7 @@ def test_agrees_with_the_loop_of_andes(grid: Grid, bus: int) -> None:
 def test_second_order_in_the_step(grid: Grid) -> None:
     fault = BusFault(77, start=0.1, clear=0.1)
     v = [
-        grid.waveforms(NO_VRT, fault, until=0.6, step=step)[75].at([0.14, 0.3, 0.6])
+        grid.waveforms(NO_VRT, fault, until=0.6, step=step, engine="andes")[75].at([0.14, 0.3, 0.6])
         for step in (1 / 100, 1 / 200, 1 / 1600)
     ]
     coarse, fine = np.abs(v[0] - v[2]).max(), np.abs(v[1] - v[2]).max()
@@ -283,9 +287,9 @@ def test_second_order_in_the_step(grid: Grid) -> None:
 @pytest.mark.slow
 def test_faults_of_one_operating_point_do_not_touch_each_other(grid: Grid) -> None:
     faults = [BusFault(77), BusFault(103), BusFault(77, clear=0.15)]
-    together = grid.waveforms_of(NO_VRT, None, faults, until=0.5)
+    together = grid.waveforms_of(NO_VRT, None, faults, until=0.5, engine="andes")
     for fault in reversed(faults):
-        alone = grid.waveforms(NO_VRT, fault, until=0.5)
+        alone = grid.waveforms(NO_VRT, fault, until=0.5, engine="andes")
         for bus in SITES:
             np.testing.assert_allclose(together[fault][bus].v, alone[bus].v, rtol=0, atol=1e-9)
 
@@ -313,7 +317,7 @@ def test_all_load_at_the_slack_bus_on_request(grid: Grid) -> None:
 @pytest.mark.slow
 def test_a_power_flow_without_solution_names_the_bus(grid: Grid) -> None:
     with pytest.raises(SimulationError) as failure:
-        grid.waveforms({21: 1500.0}, BusFault(77))
+        grid.waveforms({21: 1500.0}, BusFault(77), engine="andes")
     text = str(failure.value)
     assert text.startswith("ieee118, base: power flow has no solution; the largest mismatch, ")
     assert text.endswith("Way out: host less there, or check load_scale and the voltage set points.")
@@ -322,7 +326,7 @@ def test_a_power_flow_without_solution_names_the_bus(grid: Grid) -> None:
 @pytest.mark.slow
 def test_a_machine_that_falls_out_of_step_is_named(grid: Grid) -> None:
     long, short = BusFault(9, clear=0.6), BusFault(77)
-    runs = grid.waveforms_of({}, None, [long, short])
+    runs = grid.waveforms_of({}, None, [long, short], engine="andes")
     assert runs[short].completed
     assert not runs[long].completed
     assert "lost synchronism at t = " in runs[long].status
@@ -343,7 +347,7 @@ def test_a_limit_that_is_exceeded_before_the_fault_is_named(tmp_path: Path) -> N
     (tmp_path / "small.dyr").write_text(text.replace(lines[0], narrow))
     grid = Grid.from_case(tmp_path / "small.raw", sites=(9,))
     with pytest.raises(SimulationError) as failure:
-        grid.waveforms({9: 10.0}, BusFault(4))
+        grid.waveforms({9: 10.0}, BusFault(4), engine="andes")
     assert str(failure.value).startswith(
         "small, base: 1 limit(s) are exceeded before the fault: TGOV1 'TGOV1_1': VMAX = "
     )
@@ -360,7 +364,7 @@ def andes_cases() -> Path:
 def test_a_case_without_dynamic_data_says_what_to_add() -> None:
     grid = Grid.from_case(andes_cases() / "matpower" / "case14.m", sites=(9,))
     with pytest.raises(InputError) as failure:
-        grid.waveforms({9: 5.0}, BusFault(4))
+        grid.waveforms({9: 5.0}, BusFault(4), engine="andes")
     assert str(failure.value) == (
         "case14, base: the case has no dynamic data, not one machine. Way out: add a machine (GENROU, "
         "GENCLS) for each "
@@ -382,7 +386,7 @@ def test_other_cases_run(case: str, sites: tuple[int, ...], bus: int) -> None:
     hosting = {site: 10.0 for site in sites}
     point = grid.operating_point(hosting)
     assert power_flow_mismatch(grid, point, hosting, Period()) < 5e-3  # ANDES adds 1e-8 pu to each r and x
-    run = grid.waveforms_of(hosting, None, [BusFault(bus)])[BusFault(bus)]
+    run = grid.waveforms_of(hosting, None, [BusFault(bus)], engine="andes")[BusFault(bus)]
     assert run.completed, run.status
     for w in run.waveforms.values():
         assert abs(w.at(0.15)) < 0.75 * abs(w.v[0])

@@ -96,7 +96,7 @@ def test_screen_of_ieee118_is_what_andes_finds_at_clearing() -> None:
     screen = screen_faults(grid, [period], confirm_until=None)
     by_bus = {r.bus: r for r in screen.rows}
     assert len(by_bus) == 114
-    for fault, run in grid.waveforms_of({}, period, screen.faults, until=0.3).items():
+    for fault, run in grid.waveforms_of({}, period, screen.faults, until=0.3, engine="andes").items():
         for k, site in enumerate(grid.sites):
             w = run[site]
             at_clearing = w.v[np.flatnonzero(w.t == fault.cleared_at)[0]]

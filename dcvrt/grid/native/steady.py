@@ -263,7 +263,7 @@ class Flow:
         at, slack, y = network.generator_index, network.slack, equations.y
         base = network.base_mva
         p_set, p_max = network.generators.p_set / base, network.generators.p_max / base
-        total = float(p_set.sum() + load.real.sum() - network.p_load.sum() / base)
+        first = total = float(p_set.sum() + load.real.sum() - network.p_load.sum() / base)
         angle, size = np.angle(start), abs(start)
         n, m = len(equations.free), len(equations.pq)
         for step in range(STEPS + 1):
@@ -285,6 +285,8 @@ class Flow:
             angle[equations.free] -= move[:n]
             size[equations.pq] -= move[n : n + m]
             total -= float(move[-1])
+        if rule != "slack":  # raises where the units cannot supply it; a step of the search may go beyond
+            redispatch.share(p_set, p_max, total if level < ACCEPTED else first)
         if not level < ACCEPTED:
             worst = int(np.argmax(np.nan_to_num(abs(rest), nan=np.inf)))
             raise SimulationError(
@@ -310,10 +312,18 @@ class Flow:
 def _dispatch(
     p_set: Floats, p_max: Floats, is_slack: npt.NDArray[np.bool_], total: float, rule: str
 ) -> tuple[Floats, Floats]:
-    """Output of every unit at a total, and its derivative."""
+    """Output of every unit at a total, and its derivative; continued beyond what the units can supply."""
     if rule == "slack":
         p = np.where(is_slack, total - p_set[~is_slack].sum(), p_set)
         return p, is_slack.astype(float)
+    fixed, ceiling = np.where(p_set > 0, 0.0, p_set), np.where(p_set > 0, p_max, 0.0)
+    beyond = total - fixed.sum() - ceiling.sum()
+    if beyond > 0:
+        weight = ceiling / ceiling.sum()
+        return fixed + ceiling + beyond * weight, weight
+    if total < fixed.sum():
+        weight = np.where(p_set > 0, p_set, 0.0) / p_set[p_set > 0].sum()
+        return fixed + (total - fixed.sum()) * weight, weight
     p = redispatch.share(p_set, p_max, total)
     weight = np.where((p_set > 0) & (p < p_max), p_set, 0.0)
     return p, weight / weight.sum() if weight.any() else weight
