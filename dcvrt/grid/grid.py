@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.dae import Dae
 from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
 from dcvrt.grid.faults import BusFault, Fault, FaultSequence, LineTrip, branch
@@ -182,7 +183,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> dict[int, Waveform]:
         """POI voltage at every site under one fault.
 
@@ -204,11 +205,11 @@ class Grid:
             Quantities that the waveforms carry tangents of, with `native`: `H` (every site) or `H_<bus>`, MW;
             `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
             cleared, s.
-        facilities : mapping of site to Diagram, optional
+        facilities : mapping of site to Diagram or Dae, optional
             Facilities that act back on the network, with `native`; what is hosted at other sites is a
             constant
             impedance in the fault. Each has the site's capacity, the period's load factor and the grid's
-            power factor; its own `beta`.
+            power factor; its own `beta`. A Dae, once compiled, is prepared once; a Diagram in every call.
 
         Returns
         -------
@@ -238,7 +239,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> dict[Fault, FaultRun]:
         """Several faults of one operating point, which is solved and initialised once; see `waveforms`.
 
@@ -270,7 +271,7 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         bolted = [fault for fault in faults if isinstance(fault, BusFault)]
         point = self.operating_point(hosting, period, bolted)
@@ -287,7 +288,7 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         by = thetas(wrt, self.sites, self.network)
         point = self.native.point(hosting, period, by, facilities)
@@ -374,7 +375,7 @@ class Grid:
         engine: str,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> None:
         problems = []
         if engine not in ENGINES:

@@ -7,10 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.dae import Dae
 from dcvrt.errors import InputError, raise_all
 from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
@@ -132,7 +134,7 @@ class Engine:
         hosting: Mapping[int, float],
         period: Period,
         wrt: Sequence[Theta] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> NativePoint:
         """Solve and initialise an operating point.
 
@@ -165,9 +167,6 @@ class Engine:
         sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
         for row, unit in enumerate(unit for group in coupled for unit in group.units):
             sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
-        system = (
-            self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
-        )
         where = f"{network.name}, {period.name}"
         system = self._system(tuple(self._devices(fed)), coupled)
         return NativePoint(system, load, changes, fed, sizes, self.rule, self.reactive_limits, where)
@@ -193,33 +192,39 @@ class Engine:
         return {}
 
     def _coupled(
-        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram]
+        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram | Dae]
     ) -> tuple[Group, ...]:
         """Facilities as units, those of one diagram together; a site that hosts nothing has none."""
-        by_diagram: dict[int, list[int]] = {}
-        for bus, diagram in facilities.items():
+        alike: dict[int, list[int]] = {}
+        for bus, facility in facilities.items():
             if hosting.get(bus, 0.0) > 0:
-                by_diagram.setdefault(id(diagram), []).append(bus)
+                alike.setdefault(id(facility), []).append(bus)
         pf = float(np.cos(np.angle(self.per_hosted)))
         given = {"H": 1.0, "d": period.dc_factor, "pf": pf}
         made = []
-        for buses in by_diagram.values():
-            diagram = facilities[buses[0]]
-            if diagram not in self._structures:
-                self._structures[diagram] = Structure(diagram.compile(), "v_poi", "i", -1.0, sized=True)
-            structure = self._structures[diagram]
+        for buses in alike.values():
+            facility = facilities[buses[0]]
+            structure = self._structure_of(facility)
             known = {path: value for path, value in given.items() if path in structure.dae.p_names}
             structure.dae.parameter_values(**known)
             units = [
-                Unit(f"facility {diagram.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
+                Unit(f"facility {facility.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
                 for bus in buses
             ]
             made.append(Group(structure, units))
         return tuple(made)
 
+    def _structure_of(self, facility: Diagram | Dae) -> Structure:
+        """What the network sees of a facility; kept for a compiled one, which can't change."""
+        if isinstance(facility, Diagram):
+            return Structure(facility.compile(), "v_poi", "i", -1.0, sized=True)
+        if facility not in self._structures:
+            self._structures[facility] = Structure(facility, "v_poi", "i", -1.0, sized=True)
+        return self._structures[facility]
+
     @cached_property
-    def _structures(self) -> dict[Diagram, Structure]:
-        return {}
+    def _structures(self) -> WeakKeyDictionary[Dae, Structure]:
+        return WeakKeyDictionary()
 
     def simulate(
         self, point: NativePoint, fault: Fault, times: Sequence[Floats], wrt: Sequence[Theta] = ()
