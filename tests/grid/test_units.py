@@ -239,7 +239,7 @@ FOLLOWED = {"kundur": 2e-3, "ieee14": 5e-3, "ieee39": 1.5e-2, "ieee118": 4e-3}
 """Largest error of any state over its largest swing, with ANDES at 1/480 s."""
 RINGS = "esst3a"
 """Its inner field regulator has a pole at -23000 1/s, on which the trapezoidal rule at 1/480 s rings: ANDES's
-states are no reference there. That of `ieee14` is slower by a factor of 200."""
+states are no reference there. That of `ieee14` is slower by two orders."""
 START, CLEARED, UNTIL = 0.1, 0.2, 1.5
 
 
