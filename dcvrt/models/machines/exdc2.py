@@ -169,9 +169,8 @@ class Ieeex1BusFed(Ieeex1):
 
     All else as in IEEEX1. On a limit the output moves with it, and the lag starts from where the limit is
     when it lets go; the state v_r means nothing meanwhile. A limit that rises at a stroke, as a fault is
-    cleared,
-    takes the output with it; a lag that had to catch up first would need a fraction of T_A, as long as what
-    is asked for is far beyond the limit.
+    cleared, takes the output with it; a lag that had to catch up first would need a fraction of T_A, as long
+    as what is asked for is far beyond the limit.
     Valid for direct-current exciters whose regulator is fed from the terminals.
     Equilibrium: as IEEEX1.
     Source: IEEE Std 421.5, the limits of type DC2A.
