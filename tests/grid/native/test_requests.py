@@ -30,8 +30,8 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
     for line in (
         "wrt: 'H_22': bus 22 is not one of the sites 21, 75, 106, 108.",
         "wrt: 'wind_690': no bus 690.",
-        "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) and "
-        "clear (s).",
+        "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) "
+        "and clear (s).",
         "facilities: bus 22 is not a candidate site.",
         "hosting at bus 75 = -1.0 MW must be a number of at least 0.",
         "fault: no bus 1180.",
