@@ -41,6 +41,25 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
         assert f"\n  {line}" in text
 
 
+def test_more_derivatives_than_a_run_carries() -> None:
+    sites = tuple(bus for bus in range(1, 70) if bus != 17)
+    with pytest.raises(InputError) as failure:
+        Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), wrt=("H",))
+    assert str(failure.value) == (
+        "ieee118: wrt: 68 quantities; one run carries derivatives by 64 at most. Way out: ask for them in "
+        "several calls."
+    )
+
+
+def test_as_many_derivatives_as_a_run_carries() -> None:
+    sites = tuple(range(1, 65))
+    many = Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), until=0.25, wrt=("H",))
+    one = Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), until=0.25, wrt=("H_64",))
+    assert len(many[1].tangents) == 64
+    largest = np.abs(one[1].tangents["H_64"]).max()
+    assert np.abs(many[1].tangents["H_64"] - one[1].tangents["H_64"]).max() < 1e-3 * largest
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
