@@ -192,9 +192,9 @@ class FaultSequence:
 
     Examples
     --------
-    >>> shots = FaultSequence((BusFault(23, 0.1, 0.07), BusFault(23, 0.6, 0.07)))
+    >>> shots = FaultSequence((BusFault(23, 0.1, 0.1), BusFault(23, 0.6, 0.1)))
     >>> shots.cleared_at
-    0.67
+    0.7
     """
 
     events: tuple[BusFault | LineTrip, ...]

@@ -168,7 +168,7 @@ def test_a_run_that_fails_leaves_nothing_behind(grid: Grid) -> None:
         np.testing.assert_array_equal(alone[bus].v, runs[BusFault(77)][bus].v)
 
 
-def test_two_threads_with_grids_of_their_own_do_not_touch_each_other() -> None:
+def test_two_threads_do_not_touch_each_other() -> None:
     hosting, faults = {7: 30.0}, [BusFault(8, clear=c) for c in (0.05, 0.06, 0.07, 0.08)]
 
     def all_of(grid: Grid) -> list[np.ndarray]:
@@ -179,6 +179,8 @@ def test_two_threads_with_grids_of_their_own_do_not_touch_each_other() -> None:
     assert len(grids[1].native.system.groups) > 0
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(all_of, grids * 3))
+    with ThreadPoolExecutor(2) as pool:  # and where they share one
+        found += list(pool.map(all_of, [grids[0]] * 4))
     for values in found:
         for a, b in zip(values, expected, strict=True):
             np.testing.assert_array_equal(a, b)
