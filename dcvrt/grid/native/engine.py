@@ -55,6 +55,8 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
     InputError
         With every name that is none; when there are more than a run carries.
     """
+    if isinstance(wrt, str):
+        raise InputError(f"{network.name}: wrt = {wrt!r} must be a tuple of names: wrt=({wrt!r},).")
     names = [name for w in wrt for name in ([f"H_{b}" for b in sites] if w == "H" else [w])]
     found, problems = [], []
     for name in dict.fromkeys(names):

@@ -26,13 +26,14 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
             facilities={22: object()},  # type: ignore[dict-item]
         )
     text = str(failure.value)
-    assert text.startswith("ieee118: 8 problems\n")
+    assert text.startswith("ieee118: 9 problems\n")
     for line in (
         "wrt: 'H_22': bus 22 is not one of the sites 21, 75, 106, 108.",
         "wrt: 'wind_690': no bus 690.",
         "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) "
         "and clear (s).",
         "facilities: bus 22 is not a candidate site.",
+        "facilities: object at bus 22 is no diagram. Way out: facility.gfl() and its like.",
         "hosting at bus 75 = -1.0 MW must be a number of at least 0.",
         "fault: no bus 1180.",
         "no branch joins buses 23 and 26. Those at either end: ",
@@ -77,6 +78,35 @@ def test_events_that_cannot_be(make: object, said: str) -> None:
     with pytest.raises(InputError) as failure:
         make()  # type: ignore[operator]
     assert said in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wrt": "load"}, "ieee118: wrt = 'load' must be a tuple of names: wrt=('load',)."),
+        (
+            {"facilities": {75: object()}},
+            "ieee118: facilities: object at bus 75 is no diagram. Way out: facility.gfl() and its like.",
+        ),
+        (
+            {"fault": FaultSequence((LineTrip(23, 24, 0.1), LineTrip(24, 23, 0.2)))},
+            "ieee118: every branch that joins buses 24 and 23 is open already.",
+        ),
+    ],
+)
+def test_other_requests_that_cannot_be(grid: Grid, arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError) as failure:
+        grid.waveforms(NO_VRT, **({"fault": BusFault(77)} | arguments))  # type: ignore[arg-type]
+    assert str(failure.value) == message
+
+
+def test_parallel_lines_open_one_after_the_other(grid: Grid) -> None:
+    net = grid.network
+    both = FaultSequence((LineTrip(49, 54, 0.1), LineTrip(54, 49, 0.2)))
+    one, two = (stage.out for stage in both.stages(net)[1:])
+    assert len(one) == 1
+    assert len(two) == 2
+    assert all({net.branches.from_bus[k], net.branches.to_bus[k]} == {49, 54} for k in two)
 
 
 def test_until_before_the_last_event(grid: Grid) -> None:
