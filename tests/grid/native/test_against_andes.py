@@ -42,11 +42,10 @@ def differences(grid: Grid, hosting: dict[int, float], period: Period, net: Netw
 @pytest.mark.slow
 @pytest.mark.parametrize("period", [Period(), WINDY], ids=["base", "windy"])
 def test_power_flow_of_the_large_case_with_redispatch(grid: Grid, period: Period) -> None:
-    """ANDES's redispatch is settled to 1e-7 pu of the slack bus only."""
     same = differences(grid, NO_VRT, period, as_andes_computes(grid.network))
-    assert max(same) < 1e-7, same
+    assert max(same) < 1e-8, same
     without = differences(grid, NO_VRT, period, grid.network)
-    assert max(without) < 3e-7, without  # what the 1e-8 pu come to
+    assert max(without) < 1e-7, without  # what the 1e-8 pu come to
 
 
 @pytest.mark.slow

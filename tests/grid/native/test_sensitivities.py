@@ -14,7 +14,7 @@ from dcvrt.grid.faults import FaultSequence
 from dcvrt.grid.native.engine import Engine
 from dcvrt.grid.native.run import Simulated
 from dcvrt.models.machines import GenRou, Sexs, Tgov1
-from tests.grid.native.cases import NO_VRT, TIGHTEST, WINDY, away, engine, network, run, unit
+from tests.grid.native.cases import NO_VRT, TIGHTEST, WINDY, away, case, engine, network, run, unit
 
 STEP = {"H": 0.5, "wind": 0.5, "load": 1e-4, "clear": 2e-5}
 
@@ -195,3 +195,22 @@ def test_derivatives_asked_for_do_not_change_the_voltages(grid: Grid) -> None:
     _, plain, _ = run(of, NO_VRT, fault, 1.0)
     _, more, _ = run(of, NO_VRT, fault, 1.0, ("H", "load"))
     assert np.abs(plain.v - more.v).max() < 1e-7  # other steps
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "site", "bus"), [("kundur/kundur_full.xlsx", 7, 8), ("ieee39/ieee39_full.xlsx", 15, 16)]
+)
+def test_of_other_cases(name: str, site: int, bus: int) -> None:
+    of, fault = case(name, (site,)).native, BusFault(bus, 0.1, 0.08)
+    names = (f"H_{site}", "load", "clear")
+    worst = compare(of, {site: 10.0}, Period(), fault, names, even(fault, of, 1.0), same_events)
+    assert max(worst.values()) < 1e-6, worst
+
+
+def test_with_units_at_their_reactive_limits(grid: Grid) -> None:
+    of, fault = replace(grid.native, reactive_limits=True), BusFault(77)
+    hosting = {b: 0.5 * mw for b, mw in NO_VRT.items()}
+    assert of.point(hosting, WINDY).steady.at_limit
+    worst = compare(of, hosting, WINDY, fault, ("H_75",), even(fault, of, 0.5), same_events)
+    assert max(worst.values()) < 1e-6, worst
