@@ -407,6 +407,12 @@ class Grid:
             for bus in facilities or {}
             if bus not in self.sites
         ]
+        problems += [
+            f"facilities: {type(diagram).__name__} at bus {bus} is no diagram. Way out: facility.gfl() and "
+            "its like."
+            for bus, diagram in (facilities or {}).items()
+            if engine == "native" and not isinstance(diagram, Diagram)
+        ]
         for bus, mw in hosting.items():
             if bus not in self.sites:
                 problems.append(f"hosting at bus {bus}: not a candidate site.{did_you_mean(bus, self.sites)}")
@@ -428,6 +434,8 @@ class Grid:
                         "a fault at "
                         "its own bus. Way out: a fault at a neighbouring bus."
                     )
+            if isinstance(fault, FaultSequence) and not problems:
+                problems += self._problems(fault.stages, self.network)
             if until <= fault.cleared_at:
                 problems.append(
                     f"fault at {fault.label}: until = {until:g} s ends before it is cleared at "

@@ -18,7 +18,7 @@ from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
 from dcvrt.grid.native.point import NativePoint, System, refuse_islands
-from dcvrt.grid.native.run import Options, Simulated
+from dcvrt.grid.native.run import MOST_DIRECTIONS, Options, Simulated
 from dcvrt.grid.native.steady import Flow, directions, loads
 from dcvrt.grid.native.structure import SCALE, Structure
 from dcvrt.grid.network import Network
@@ -55,8 +55,10 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
     Raises
     ------
     InputError
-        With every name that is none.
+        With every name that is none; when there are more than a run carries.
     """
+    if isinstance(wrt, str):
+        raise InputError(f"{network.name}: wrt = {wrt!r} must be a tuple of names: wrt=({wrt!r},).")
     names = [name for w in wrt for name in ([f"H_{b}" for b in sites] if w == "H" else [w])]
     found, problems = [], []
     for name in dict.fromkeys(names):
@@ -74,6 +76,11 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
         elif bus is not None and bus not in set(network.bus.tolist()):
             problems.append(f"wrt: {name!r}: no bus {bus}.")
         found.append(Theta(name, match["kind"] or match["whole"], bus))
+    if len(found) > MOST_DIRECTIONS:
+        problems.append(
+            f"wrt: {len(found)} quantities; one run carries derivatives by {MOST_DIRECTIONS} at most. "
+            "Way out: ask for them in several calls."
+        )
     raise_all(problems, network.name, InputError)
     return tuple(found)
 

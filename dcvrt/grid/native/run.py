@@ -30,6 +30,8 @@ Phasors = npt.NDArray[np.complex128]
 BLOCK = 8
 EVENT_ROOM = 4096
 ALIGNMENT = 64
+MOST_DIRECTIONS = 64
+"""Derivatives that one run carries; the driver holds room for so many."""
 STATUSES = {
     0: "",
     1: "left its valid range",

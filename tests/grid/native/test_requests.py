@@ -26,19 +26,39 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
             facilities={22: object()},  # type: ignore[dict-item]
         )
     text = str(failure.value)
-    assert text.startswith("ieee118: 8 problems\n")
+    assert text.startswith("ieee118: 9 problems\n")
     for line in (
         "wrt: 'H_22': bus 22 is not one of the sites 21, 75, 106, 108.",
         "wrt: 'wind_690': no bus 690.",
-        "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) and "
-        "clear (s).",
+        "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) "
+        "and clear (s).",
         "facilities: bus 22 is not a candidate site.",
+        "facilities: object at bus 22 is no diagram. Way out: facility.gfl() and its like.",
         "hosting at bus 75 = -1.0 MW must be a number of at least 0.",
         "fault: no bus 1180.",
         "no branch joins buses 23 and 26. Those at either end: ",
         "fault at bus 75: it is a candidate site",
     ):
         assert f"\n  {line}" in text
+
+
+def test_more_derivatives_than_a_run_carries() -> None:
+    sites = tuple(bus for bus in range(1, 70) if bus != 17)
+    with pytest.raises(InputError) as failure:
+        Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), wrt=("H",))
+    assert str(failure.value) == (
+        "ieee118: wrt: 68 quantities; one run carries derivatives by 64 at most. Way out: ask for them in "
+        "several calls."
+    )
+
+
+def test_as_many_derivatives_as_a_run_carries() -> None:
+    sites = tuple(range(1, 65))
+    many = Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), until=0.25, wrt=("H",))
+    one = Grid.from_case("ieee118", sites=sites).waveforms({1: 5.0}, BusFault(77), until=0.25, wrt=("H_64",))
+    assert len(many[1].tangents) == 64
+    largest = np.abs(one[1].tangents["H_64"]).max()
+    assert np.abs(many[1].tangents["H_64"] - one[1].tangents["H_64"]).max() < 1e-3 * largest
 
 
 @pytest.mark.parametrize(
@@ -58,6 +78,35 @@ def test_events_that_cannot_be(make: object, said: str) -> None:
     with pytest.raises(InputError) as failure:
         make()  # type: ignore[operator]
     assert said in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wrt": "load"}, "ieee118: wrt = 'load' must be a tuple of names: wrt=('load',)."),
+        (
+            {"facilities": {75: object()}},
+            "ieee118: facilities: object at bus 75 is no diagram. Way out: facility.gfl() and its like.",
+        ),
+        (
+            {"fault": FaultSequence((LineTrip(23, 24, 0.1), LineTrip(24, 23, 0.2)))},
+            "ieee118: every branch that joins buses 24 and 23 is open already.",
+        ),
+    ],
+)
+def test_other_requests_that_cannot_be(grid: Grid, arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError) as failure:
+        grid.waveforms(NO_VRT, **({"fault": BusFault(77)} | arguments))  # type: ignore[arg-type]
+    assert str(failure.value) == message
+
+
+def test_parallel_lines_open_one_after_the_other(grid: Grid) -> None:
+    net = grid.network
+    both = FaultSequence((LineTrip(49, 54, 0.1), LineTrip(54, 49, 0.2)))
+    one, two = (stage.out for stage in both.stages(net)[1:])
+    assert len(one) == 1
+    assert len(two) == 2
+    assert all({net.branches.from_bus[k], net.branches.to_bus[k]} == {49, 54} for k in two)
 
 
 def test_until_before_the_last_event(grid: Grid) -> None:

@@ -840,13 +840,16 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
         if (r.d && s[k].dfrom) { /* the begin of the stretch moves with theta: S+ = S- + (f- - f+) dt */
             int moves = 0;
             for (long d = 0; d < r.d; d++) moves |= s[k].dfrom[d] != 0.0;
-            if (moves && k > 0) {
-                r.network = s[k - 1].network;
-                int bad = rates(&r, s[k].from, &r.now, &r.k[1]);
+            if (moves) {
+                int bad = 0; /* before the first stretch everything is at rest: f- = 0 */
+                if (k > 0) {
+                    r.network = s[k - 1].network;
+                    bad = rates(&r, s[k].from, &r.now, &r.k[1]);
+                }
                 r.network = s[k].network, r.factored = 0;
                 bad |= rates(&r, s[k].from, &r.now, &r.k[2]);
                 if (bad) { status = failed(&r, NO_VOLTAGE, s[k].from, 0, 0, 0, 0); break; }
-                shift_by(&r, r.k[1].f, 1.0, s[k].dfrom);
+                if (k > 0) shift_by(&r, r.k[1].f, 1.0, s[k].dfrom);
                 shift_by(&r, r.k[2].f, -1.0, s[k].dfrom);
             }
         }
