@@ -140,8 +140,9 @@ class Findings:
 
     @property
     def methods(self) -> list[str]:
-        """Surrogate methods in the order of the study file."""
-        return list(self.study.surrogate.methods)
+        """Surrogate methods in the order of the study file, then the frontier where it was searched."""
+        searched = any(row["method"] == "frontier" for row in self.summary["rows"])
+        return [*self.study.surrogate.methods, *(["frontier"] if searched else [])]
 
     @property
     def faults(self) -> list[FaultEntry]:

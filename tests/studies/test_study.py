@@ -254,7 +254,9 @@ def check_summary(summary: dict) -> None:
         assert row["total_mw"] == pytest.approx(sum(row["by_site"].values()))
         assert row["total_mw"] <= summary["no_vrt"]["total_mw"] + 1e-3
         totals.setdefault((row["method"], row["mode"]), []).append(row["total_mw"])
-    for values in totals.values():
+    for (method, _), values in totals.items():
+        if method == "frontier":  # more rating can cost margin in grid-forming mode, and the search sees it
+            continue
         assert all(b >= a - 1e-6 for a, b in itertools.pairwise(values))
     for row in summary["surrogate"]:
         assert set(row) == {
