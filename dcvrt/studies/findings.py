@@ -107,6 +107,14 @@ class Findings:
             return store.plans()
 
     @cached_property
+    def comparison(self) -> dict[str, Any]:
+        """The paper's method and the frontier side by side."""
+        from dcvrt.studies.comparison import comparison
+
+        with self._store() as store:
+            return comparison(store)
+
+    @cached_property
     def what_ifs(self) -> pd.DataFrame:
         """Least ratings of the largest plans under varied assumptions."""
         with self._store() as store:

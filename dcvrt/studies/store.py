@@ -39,8 +39,8 @@ binding and
                ac_v_min_pu, ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed,
                worst_voltage_margin_pu, worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss,
                aggregate: where; reactive: {plan, unhosted: units beyond their reactive limits in the AC power
-               flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed; search (JSON), of
-               method 'frontier', how it was found: candidates, refused, gap, settled, by_sequence, margins
+               flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed; search (JSON),
+               of method 'frontier', how it was found: candidates, refused, gap, settled, by_sequence, margins
                (that bind: period, fault, site, target, label, price, by_beta, mechanism).
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
                (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,

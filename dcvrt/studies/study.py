@@ -255,6 +255,19 @@ class Result:
         found: dict[str, Any] = json.loads((self.folder / outputs.SUMMARY).read_text(encoding="utf-8"))
         return found
 
+    def closed(self) -> list[str]:
+        """Why sites are closed at the highest rating of each mode, by the last method of the study."""
+        rows = self.summary["rows"]
+        last: dict[str, dict[str, Any]] = {}
+        for row in sorted(rows, key=lambda row: (row["beta"], row["method"] == frontier.METHOD)):
+            last[row["mode"]] = row
+        return [
+            f"{mode}, beta {row['beta']:g}, bus {entry['bus']}: {entry['label']}"
+            for mode, row in last.items()
+            for entry in row["binding"]
+            if entry["kind"] == "closed"
+        ]
+
     def table(self) -> pd.DataFrame:
         """One row per plan: capacities, replay and power-flow verdicts."""
         with Store(self.folder / outputs.STORE) as store:

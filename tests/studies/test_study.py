@@ -150,6 +150,12 @@ def test_what_is_refused_before_the_first_task_leaves_no_folder(
 
 def test_values_that_no_run_takes_are_refused_before_the_first_task(tmp_path: Path) -> None:
     request = {
+        "case": "ieee118",
+        "dynamics": None,
+        "sites": [21],
+        "redispatch": "proportional",
+        "engine": "native",
+        "gradients": False,
         "runs": [["gfl", 1.0], ["gfl", 9.0]],
         "parameters": {},
         "period": {"dc_factor": 0.05},
