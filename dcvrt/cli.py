@@ -166,6 +166,14 @@ def _show(result: object) -> None:
             file=sys.stderr,
         )
         raise typer.Exit(INCOMPLETE)
+    if not any(row["total_mw"] > 0 for row in result.summary["rows"]):
+        print(
+            "No plan meets the criteria: every site is closed at every rating, in every mode.",
+            file=sys.stderr,
+        )
+        for line in result.closed():
+            print(f"  {line}", file=sys.stderr)
+        raise typer.Exit(INFEASIBLE)
 
 
 def _console(width: int = 140) -> Console:

@@ -47,6 +47,8 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         `period`: {name, hour, load_scale, wind {bus: MW}, dc_factor};
         `faults`: [{bus, t_start_s, t_clear_ms, x_pu}];
         `runs`: [[mode, beta], ...]; `parameters`: {mode: {path: value}}; `criteria`: keywords of `Criteria`;
+        `engine`: simulator of the faults, `native` or `andes`;
+        `gradients`: True for the derivatives of every margin, with the native engine;
         `keep`: True to give back the waveforms too: the voltages of all faults and, for each run, the
         facility where its voltage margin and where its loss margin is least.
 
@@ -54,9 +56,17 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
     -------
     dict
         `rows`: one for each fault, site and run, with the columns of the store's `margins` (no hosting name);
+        with gradients, `gradients` = {`voltage`, `loss`, `v_poi`: {theta: derivative}}, of the voltage margin
+        in pu, the loss margin as a share, the lowest POI voltage in pu, by `beta` and every `H_<bus>` in MW;
         `waveforms`: those kept, as keywords of `Store.put_waveform` with `signals`;
         `grid`, `facility`: simulations made.
         A simulation that failed gives rows with ok = 0, its status and no margins.
+
+    Notes
+    -----
+    The derivative by H_j is total: through power flow, equilibrium of the machines, fault and clearing into
+    the voltage, and through the facility into the margin. On its own base the facility does not change with
+    its size, so there is no further term by the site's own H.
     """
     from dcvrt.grid import Period
 
@@ -65,49 +75,47 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
     period = Period(wind=wind, **given)
     sites = [int(bus) for bus in request["sites"]]
     hosting = dict(zip(sites, map(float, request["hosting"]), strict=True))
-    runs, keep = [(mode, float(beta)) for mode, beta in request["runs"]], bool(request.get("keep", False))
+    runs = [(mode, float(beta)) for mode, beta in request["runs"]]
     answer: dict[str, Any] = {"rows": [], "waveforms": [], "grid": 0, "facility": 0}
+    found: dict[str, Mapping[int, Waveform]] = {}
     for label, waveforms, status in _fault_runs(request, hosting, period):
         answer["grid"] += 1
         if waveforms is None:
             answer["rows"] += lost_rows(request, status, "grid", faults=[label])
-            continue
-        rows = []
-        for mode in dict.fromkeys(mode for mode, _ in runs):
-            betas = [beta for m, beta in runs if m == mode]
-            rows += _facility_rows(
-                request, period.name, label, mode, betas, waveforms, hosting, period.dc_factor
-            )
+        else:
+            found[label] = waveforms
+    for mode in dict.fromkeys(mode for mode, _ in runs) if found else ():
+        betas = [beta for m, beta in runs if m == mode]
+        rows = _facility_rows(request, period.name, mode, betas, found, hosting, period.dc_factor)
         answer["rows"] += rows
         answer["facility"] += len(rows)
-        if keep:
-            answer["waveforms"] += [
+    if not request.get("keep", False):
+        return answer
+    answer["waveforms"] = [
+        {
+            "period": period.name,
+            "fault": label,
+            "site": site,
+            "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)},
+        }
+        for label, waveforms in found.items()
+        for site, w in waveforms.items()
+    ]
+    for mode, beta in runs:
+        for fault, site in _worst(answer["rows"], hosting, mode, beta):
+            run = simulator_of(mode, request["parameters"].get(mode, {}))(
+                found[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"])
+            )
+            answer["waveforms"].append(
                 {
                     "period": period.name,
-                    "fault": label,
+                    "fault": fault,
                     "site": site,
-                    "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)},
+                    "mode": mode,
+                    "beta": beta,
+                    "signals": _signals(run),
                 }
-                for site, w in waveforms.items()
-            ]
-            answer.setdefault("_waveforms", {})[label] = waveforms
-    if keep:
-        kept = answer.pop("_waveforms", {})
-        for mode, beta in runs:
-            for fault, site in _worst(answer["rows"], hosting, mode, beta):
-                run = simulator_of(mode, request["parameters"].get(mode, {}))(
-                    kept[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"])
-                )
-                answer["waveforms"].append(
-                    {
-                        "period": period.name,
-                        "fault": fault,
-                        "site": site,
-                        "mode": mode,
-                        "beta": beta,
-                        "signals": _signals(run),
-                    }
-                )
+            )
     return answer
 
 
@@ -150,9 +158,13 @@ def prepare(request: Mapping[str, Any]) -> str:
     """
     from dcvrt.grid import andes
 
-    andes.prepare()
+    grid = _grid_of(request)
+    if request["engine"] == "andes":
+        andes.prepare()
+    else:
+        _ = grid.native.system.layout  # compiles now
     mode = request["runs"][0][0]
-    simulator = simulator_of(mode, request["parameters"].get(mode, {}))
+    simulator = simulator_of(mode, request["parameters"].get(mode, {}), thetas(request))
     for beta in [beta for m, beta in request["runs"] if m == mode]:
         simulator.dae.parameter_values(
             H=1.0, beta=beta, d=request["period"]["dc_factor"], pf=float(request["pf"])
@@ -160,9 +172,14 @@ def prepare(request: Mapping[str, Any]) -> str:
     return simulator.backend
 
 
-def simulator_of(mode: str, parameters: Mapping[str, float]) -> Simulator:
+def simulator_of(mode: str, parameters: Mapping[str, float], wrt: tuple[str, ...] = ()) -> Simulator:
     """The facility of a mode with some parameters set, as this process runs it; compiled once."""
-    return _simulator(mode, _frozen(parameters))
+    return _simulator(mode, _frozen(parameters), wrt)
+
+
+def thetas(request: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the margins of a request are differentiated by: the rating and every site's size, or nothing."""
+    return ("beta", *(f"H_{bus}" for bus in request["sites"])) if request["gradients"] else ()
 
 
 # -- the two halves ------------------------------------------------------------------------------------------
@@ -178,12 +195,15 @@ def _fault_runs(
         BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): fault_label(f)
         for f in request["faults"]
     }
-    grid = _grid(
-        request["case"], request["dynamics"], tuple(hosting), float(request["pf"]), request["redispatch"]
-    )
     try:
-        found = grid.waveforms_of(
-            hosting, period, list(labels), until=float(request["t_end_s"]), step=float(request["step_s"])
+        found = _grid_of(request).waveforms_of(
+            hosting,
+            period,
+            list(labels),
+            until=float(request["t_end_s"]),
+            engine=request["engine"],
+            step=float(request["step_s"]),
+            wrt=thetas(request)[1:],
         )
     except (SimulationError, InfeasibleError) as error:  # the operating point itself has no solution
         return [(label, None, str(error)) for label in labels.values()]
@@ -196,25 +216,28 @@ def _fault_runs(
 def _facility_rows(
     request: Mapping[str, Any],
     period: str,
-    fault: str,
     mode: str,
     betas: Sequence[float],
-    waveforms: Mapping[int, Waveform],
+    waveforms: Mapping[str, Mapping[int, Waveform]],
     hosting: Mapping[int, float],
     d: float,
 ) -> list[dict[str, Any]]:
-    """One mode at several ratings on the waveforms of one fault."""
-    simulator = simulator_of(mode, request["parameters"].get(mode, {}))
-    cases = [(site, beta) for site in waveforms for beta in betas]
+    """One mode at several ratings on the waveforms of all faults, in one batch."""
+    wrt = thetas(request)
+    simulator = simulator_of(mode, request["parameters"].get(mode, {}), wrt)
+    cases = [
+        (fault, site, beta) for fault, at_sites in waveforms.items() for site in at_sites for beta in betas
+    ]
     result = simulator.batch(
-        [waveforms[site] for site, _ in cases],
-        {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for _, beta in cases]},
+        [waveforms[fault][site] for fault, site, _ in cases],
+        {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for *_, beta in cases]},
         criteria=_criteria(_frozen(request["criteria"])),
     )
     rows = []
-    for (site, beta), status, found in zip(cases, result.status, result.margins, strict=True):
+    for (fault, site, beta), status, found in zip(cases, result.status, result.margins, strict=True):
         row = _row(period, fault, site, mode, beta, hosting[site], status, "facility")
-        row |= {"p_mw": d * hosting[site], "v_poi_min_pu": float(np.abs(waveforms[site].v).min())}
+        v_min, dv_min = lowest_voltage(waveforms[fault][site], wrt[1:])
+        row |= {"p_mw": d * hosting[site], "v_poi_min_pu": v_min}
         if found is not None:
             share, modes = found.diagnostics["loss_share"], modes_passed(found.sequence)
             row |= {
@@ -227,10 +250,35 @@ def _facility_rows(
                 "failed_in": "",
                 "sequence": ">".join(modes),
                 "battery": int("BATTERY" in modes),
-                "diagnostics": dict(found.diagnostics),
+                "diagnostics": dict(found.diagnostics)
+                | {"voltage_time": found.voltage.time, "loss_time": found.loss.time},
             }
+            if wrt:
+                row["gradients"] = {
+                    "voltage": dict(found.voltage.grad),
+                    "loss": dict(found.loss.grad),
+                    "v_poi": dv_min,
+                }
         rows.append(row)
     return rows
+
+
+def lowest_voltage(waveform: Waveform, wrt: Sequence[str] = ()) -> tuple[float, dict[str, float]]:
+    r"""Lowest magnitude among the samples, and its derivative Re(V* dV)/|V| by each tangent.
+
+    >>> from dcvrt import Waveform
+    >>> low, slope = lowest_voltage(
+    ...     Waveform.from_samples([0, 1, 2], [1, 0.5j, 1], {"H_21": [0, -1e-3j, 0]}), ["H_21"]
+    ... )
+    >>> low, slope
+    (0.5, {'H_21': -0.001})
+    """
+    size = np.abs(waveform.v)
+    at = int(size.argmin())
+    v = waveform.v[at]
+    return float(size[at]), {
+        name: float((v.conjugate() * waveform.tangents[name][at]).real / size[at]) for name in wrt
+    }
 
 
 def modes_passed(sequence: Sequence[str]) -> list[str]:
@@ -244,6 +292,11 @@ def modes_passed(sequence: Sequence[str]) -> list[str]:
 
 
 # -- what a process keeps ------------------------------------------------------------------------------------
+
+
+def _grid_of(request: Mapping[str, Any]) -> Grid:
+    sites = tuple(int(bus) for bus in request["sites"])
+    return _grid(request["case"], request["dynamics"], sites, float(request["pf"]), request["redispatch"])
 
 
 @lru_cache(maxsize=4)
@@ -260,14 +313,14 @@ def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, re
 
 
 @lru_cache(maxsize=16)
-def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...]) -> Simulator:
+def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...], wrt: tuple[str, ...]) -> Simulator:
     from dcvrt import facility
     from dcvrt.integrators import NoCompilerWarning, Simulator
 
     diagram = facility.get(mode)
     for path, value in parameters:
         diagram.set(path, value)
-    simulator = Simulator(diagram.compile(), save_at=SAVE_AT)
+    simulator = Simulator(diagram.compile(), wrt=wrt, save_at=SAVE_AT)
     with warnings.catch_warnings():  # whoever starts a study is told by `prepare`, not by every worker
         warnings.simplefilter("ignore", NoCompilerWarning)
         simulator.backend  # noqa: B018 - compiles now
@@ -312,6 +365,7 @@ def _row(
         "sequence": "",
         "battery": 0,
         "diagnostics": {},
+        "gradients": {},
     }
 
 

@@ -17,6 +17,7 @@ from dcvrt.studies.config import (
     CriteriaSection,
     FacilitySection,
     FaultEntry,
+    FrontierSection,
     GridSection,
     HostingSection,
     PeriodEntry,
@@ -111,6 +112,12 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                     f"{len(grid.sites)} sites, "
                     f"{needed} are needed. Way out: raise sampling.n or lower sampling.validation_share."
                 )
+        frontier: FrontierSection | None = sections.get("frontier")
+        if frontier is not None and frontier.search and grid.engine == "andes":
+            problems.append(
+                "frontier.search = true: needs gradients, which grid.engine = 'andes' does not give. "
+                "Way out: grid.engine = 'native', or search = false."
+            )
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
             problems += [

@@ -47,7 +47,9 @@ class GridSection(Section):
         default=None, description="path of the dynamic data, where the case keeps them apart (.dyr)"
     )
     sites: list[int] = Field(min_length=1, description="candidate buses")
-    engine: Literal["andes"] = Field(default="andes", description="simulator of the fault waveforms")
+    engine: Literal["native", "andes"] = Field(
+        default="native", description="simulator of the faults of samples and searches"
+    )
     t_end_s: Positive = Field(default=2.0, description="length of every fault simulation")
     step_s: float = Field(default=1 / 120, gt=0, le=0.05, description="step of the fault simulation")
     redispatch: Literal["proportional", "slack"] = Field(
@@ -149,6 +151,26 @@ class SurrogateSection(Section):
     )
 
 
+class FrontierSection(Section):
+    """`[frontier]`: the search for the largest plan that passes."""
+
+    search: bool = Field(default=True, description="whether it is searched; needs grid.engine = 'native'")
+    samples: int = Field(default=2, ge=2, le=4096, description="coarse hosting vectors that it starts from")
+    gain: Share = Field(default=0.005, description="share of the total that is not worth another candidate")
+    trust: Share = Field(
+        default=0.10, description="radius of the trust region, as a share of the largest site"
+    )
+    candidates: int = Field(
+        default=40, ge=1, description="hosting vectors that a mode and rating may try before it is given up"
+    )
+
+
+class ReplaySection(Section):
+    """`[replay]`: the simulation that has the last word on every plan."""
+
+    engine: Literal["native", "andes"] = Field(default="andes", description="simulator of the faults")
+
+
 class RunSection(Section):
     """`[run]`: limits of the run itself; they change no result."""
 
@@ -198,6 +220,8 @@ class StudyFile(BaseModel):
     criteria: CriteriaSection = CriteriaSection()
     sampling: SamplingSection = SamplingSection()
     surrogate: SurrogateSection = SurrogateSection()
+    frontier: FrontierSection = FrontierSection()
+    replay: ReplaySection = ReplaySection()
     run: RunSection = RunSection()
     fault: list[FaultEntry] = Field(min_length=1, description="the faults that every site must ride through")
     period: list[PeriodEntry] = Field(min_length=1, description="the hours they are simulated in")

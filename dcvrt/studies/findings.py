@@ -107,6 +107,14 @@ class Findings:
             return store.plans()
 
     @cached_property
+    def comparison(self) -> dict[str, Any]:
+        """The paper's method and the frontier side by side."""
+        from dcvrt.studies.comparison import comparison
+
+        with self._store() as store:
+            return comparison(store)
+
+    @cached_property
     def what_ifs(self) -> pd.DataFrame:
         """Least ratings of the largest plans under varied assumptions."""
         with self._store() as store:
@@ -140,8 +148,9 @@ class Findings:
 
     @property
     def methods(self) -> list[str]:
-        """Surrogate methods in the order of the study file."""
-        return list(self.study.surrogate.methods)
+        """Surrogate methods in the order of the study file, then the frontier where it was searched."""
+        searched = any(row["method"] == "frontier" for row in self.summary["rows"])
+        return [*self.study.surrogate.methods, *(["frontier"] if searched else [])]
 
     @property
     def faults(self) -> list[FaultEntry]:

@@ -1,5 +1,5 @@
 """What a study folder holds for people and programs, made from the store alone: summary.json, table.csv,
-validation.csv.
+validation.csv, frontier.json.
 
 Each file is written beside itself and then moved into place: a file that is there is whole.
 """
@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
+from dcvrt.studies.comparison import comparison
 from dcvrt.studies.store import Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
 
+FRONTIER = "frontier.json"
 STORE, SUMMARY, TABLE, VALIDATION, STUDY = (
     "study.sqlite",
     "summary.json",
@@ -68,6 +70,9 @@ def write_results(folder: Path, store: Store) -> list[Path]:
     return [
         write_atomically(folder / TABLE, plan_table(store).to_csv(index=False)),
         write_atomically(folder / VALIDATION, validation_table(store).to_csv(index=False)),
+        write_atomically(
+            folder / FRONTIER, json.dumps(_clean(comparison(store)), indent=2, allow_nan=False) + "\n"
+        ),
         write_atomically(folder / SUMMARY, json.dumps(summary(store), indent=2, allow_nan=False) + "\n"),
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.store import Store, records
 
-SAMPLES, REPLAYS = "samples", "replays"
+SAMPLES, FRONTIER, REPLAYS = "samples", "frontier", "replays"
 NO_VRT = "none"
 """Method of the plan without ride-through."""
 REACTIVE = "reactive"
@@ -73,9 +73,18 @@ class Setting:
         )
 
     def request(
-        self, hosting: Sequence[float], period: str, runs: Sequence[tuple[str, float]], keep: bool
+        self,
+        hosting: Sequence[float],
+        period: str,
+        runs: Sequence[tuple[str, float]],
+        *,
+        engine: str,
+        gradients: bool = False,
+        keep: bool = False,
+        faults: Collection[str] | None = None,
     ) -> dict[str, Any]:
-        """The request of `dcvrt.planning.replay.check_hosting` for one hosting vector and period."""
+        """The request of `dcvrt.planning.replay.check_hosting` for one hosting vector and period; of some
+        faults only, when their labels are given."""
         grid, f = self.file.grid, self.file.facility
         path = grid.case if grid.case == "ieee118" else str((self.folder / grid.case).resolve())
         dynamics = None if grid.dynamics is None else str((self.folder / grid.dynamics).resolve())
@@ -89,12 +98,24 @@ class Setting:
             "t_end_s": grid.t_end_s,
             "hosting": [float(mw) for mw in hosting],
             "period": self.periods[period],
-            "faults": [fault.model_dump() for fault in self.file.fault],
+            "faults": [
+                entry
+                for fault in self.file.fault
+                for entry in [fault.model_dump()]
+                if faults is None or replay.fault_label(entry) in faults
+            ],
             "runs": [list(run) for run in runs],
             "parameters": {mode: f.parameters | f.parameters_by_mode.get(mode, {}) for mode, _ in runs},
             "criteria": criteria(self.file),
+            "engine": engine,
+            "gradients": gradients,
             "keep": keep,
         }
+
+    @property
+    def runs(self) -> list[tuple[str, float]]:
+        """Every mode at every rating."""
+        return [(mode, beta) for mode in self.file.facility.modes for beta in self.file.facility.beta]
 
 
 def criteria(file: StudyFile) -> dict[str, Any]:
@@ -115,12 +136,11 @@ def criteria(file: StudyFile) -> dict[str, Any]:
 def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
     """Simulate every sample in every period, for all modes and ratings; messages of what was set aside."""
     samples, store = setting.samples(), campaign.store
-    runs = [(mode, beta) for mode in setting.file.facility.modes for beta in setting.file.facility.beta]
     with store.transaction():
         store.put(
             "hostings",
             [
-                _hosting(
+                hosting_row(
                     f"s{k:04}",
                     "sample",
                     "fit" if samples.fit[k] else "validation",
@@ -130,8 +150,13 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
             ],
         )
         store.note(sampled_box_mw=dict(zip(map(str, setting.sites), samples.upper.tolist(), strict=True)))
-    work = {f"s{k:04}": H for k, H in enumerate(samples.hosting.tolist())}
-    return _simulate(campaign, SAMPLES, setting, [(name, H, runs) for name, H in work.items()], keep=False)
+    engine = setting.file.grid.engine
+    jobs = [
+        Job(f"s{k:04}", setting.request(H, period, setting.runs, engine=engine))
+        for period in setting.periods
+        for k, H in enumerate(samples.hosting.tolist())
+    ]
+    return simulate(campaign, SAMPLES, jobs)
 
 
 def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
@@ -143,8 +168,15 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
         if plan["total_mw"] > 0:
             H = [plan["by_site"][str(bus)] for bus in setting.sites]
             wanted.setdefault(plan["hosting"], (H, set()))[1].add((plan["mode"], plan["beta"]))
-    lost = _simulate(
-        campaign, REPLAYS, setting, [(name, H, sorted(runs)) for name, (H, runs) in wanted.items()], keep=True
+    made = {tuple(key) for key in store.margins("plan")[["hosting", "mode", "beta"]].itertuples(index=False)}
+    lost = replay_plans(
+        campaign,
+        setting,
+        [
+            (name, H, missing)
+            for name, (H, runs) in wanted.items()
+            if (missing := sorted(run for run in runs if (name, *run) not in made))
+        ],
     )
     margins = store.margins("plan")
     with store.transaction():
@@ -165,22 +197,38 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     return lost
 
 
-def _simulate(
+@dataclass(frozen=True)
+class Job:
+    """One hosting vector in one period: the name under which its results are stored, and the request."""
+
+    name: str
+    request: dict[str, Any]
+
+
+def replay_plans(
     campaign: Campaign,
-    phase: str,
     setting: Setting,
-    work: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]],
-    keep: bool,
+    plans: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]],
 ) -> list[str]:
-    """One task for each hosting vector and period."""
+    """Replay hosting vectors, (name, capacities, modes and ratings), in every period under every fault."""
+    engine = setting.file.replay.engine
+    jobs = [
+        Job(name, setting.request(H, period, runs, engine=engine, keep=True))
+        for period in setting.periods
+        for name, H, runs in plans
+    ]
+    return simulate(campaign, REPLAYS, jobs)
+
+
+def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:
+    """One task for each job; what has been done before is not done again."""
     store = campaign.store
     names: dict[str, str] = {}
     tasks = []
-    for period in setting.periods:
-        for name, H, runs in work:
-            task = Task(phase, setting.request(H, period, runs, keep))
-            names[task.key] = name
-            tasks.append(task)
+    for job in jobs:
+        task = Task(phase, job.request)
+        names[task.key] = job.name
+        tasks.append(task)
 
     def record(task: Task, answer: Mapping[str, Any]) -> None:
         hosting = names[task.key]
@@ -299,14 +347,14 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
         return
     upper = setting.samples().upper
     total = len(file.surrogate.methods) * len(file.facility.modes) * len(file.facility.beta)
-    rows = [_plan_row(setting, NO_VRT, "", 0.0, setting.no_vrt, setting.no_vrt.closed, None)]
+    rows = [plan_row(setting, NO_VRT, "", 0.0, setting.no_vrt, setting.no_vrt.closed, None)]
     checked: dict[str, dict[str, Any]] = {}
     found = []
     for k, swept in enumerate(
         sweep(setting.problem, fits, file.facility.modes, file.facility.beta, setting.d, upper), 1
     ):
         rows.append(
-            _plan_row(
+            plan_row(
                 setting, swept.method, swept.mode, swept.beta, swept.plan, swept.closed, swept.carried_from
             )
         )
@@ -314,22 +362,19 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
         progress("plans", k, total, 0)
     for row, plan in zip(rows, [setting.no_vrt, *found], strict=True):
         if row["hosting"] not in checked:
-            checked[row["hosting"]] = _ac(setting.problem, plan)
+            checked[row["hosting"]] = power_flow(setting.problem, plan)
         row |= checked[row["hosting"]]
     with store.transaction():
         store.clear("plans")
         store.put(
             "hostings",
-            [
-                _hosting(row["hosting"], "plan", "", {int(b): mw for b, mw in row["by_site"].items()})
-                for row in rows
-            ],
+            [plan_hosting(row) for row in rows],
         )
         store.put("plans", rows)
         store.note(plans_from=digest)
 
 
-def _plan_row(
+def plan_row(
     setting: Setting,
     method: str,
     mode: str,
@@ -338,6 +383,7 @@ def _plan_row(
     closed: Mapping[int, str],
     carried_from: float | None,
 ) -> dict[str, Any]:
+    """The row of `plans` of a plan, before its checks."""
     H = {str(bus): round(plan.by_site[bus], 6) + 0.0 for bus in setting.sites}
     # A closed site is told as such, not as one whose largest size is 0; other bounds are those of the sampled
     # box.
@@ -351,7 +397,7 @@ def _plan_row(
         "method": method,
         "mode": mode,
         "beta": beta,
-        "hosting": _plan_name(H),
+        "hosting": plan_name(H),
         "total_mw": sum(H.values()),
         "by_site": H,
         "binding": binding,
@@ -360,11 +406,12 @@ def _plan_row(
     }
 
 
-def _plan_name(by_site: Mapping[str, float]) -> str:
+def plan_name(by_site: Mapping[str, float]) -> str:
+    """Name of a hosting vector, the same for the same capacities."""
     return "p" + hashlib.sha256(json.dumps(by_site, sort_keys=True).encode()).hexdigest()[:10]
 
 
-def _ac(problem: HostingProblem, plan: Plan) -> dict[str, Any]:
+def power_flow(problem: HostingProblem, plan: Plan) -> dict[str, Any]:
     """Power-flow verdict of a plan; a power flow that cannot be made is a failed verdict, not a missing
     one."""
     try:
@@ -381,7 +428,13 @@ def _ac(problem: HostingProblem, plan: Plan) -> dict[str, Any]:
     }
 
 
-def _hosting(name: str, role: str, subset: str, by_site: Mapping[int, float]) -> dict[str, Any]:
+def plan_hosting(plan: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of `hostings` of a plan."""
+    return hosting_row(plan["hosting"], "plan", "", {int(bus): mw for bus, mw in plan["by_site"].items()})
+
+
+def hosting_row(name: str, role: str, subset: str, by_site: Mapping[int, float]) -> dict[str, Any]:
+    """A row of `hostings`."""
     return {
         "name": name,
         "role": role,

@@ -8,12 +8,14 @@ order in which the work was done):
 
 `provenance`   key, value (JSON): study text and hash, versions, platform, compiler, seeds, network, sources.
 `tasks`        hash, phase, text, status (open, done, failed, timeout, quarantined), attempts, message,
-seconds. `hostings`     name, role ('sample' or 'plan'), subset ('fit', 'validation' or ''), total_mw, by_site
+seconds. `hostings`     name, role ('sample'; 'search': simulated on the way to the frontier; 'candidate':
+replayed there and no plan; 'plan'), subset ('fit', 'validation' or ''), total_mw, by_site
 {bus: MW}. `margins`      one checked facility run: hosting, period, fault, site, mode, beta; h_mw, p_mw
 (import before the
                fault); v_margin_pu, loss_margin_share, loss_margin_mw, loss_share, loss_mw; v_poi_min_pu
                (lowest retained voltage); status (a sentence), ok (1 when the run has margins), sequence
-               (modes passed through), battery (1 when the supervisor visited BATTERY), diagnostics (JSON).
+               (modes passed through), battery (1 when the supervisor visited BATTERY), diagnostics and
+               gradients (JSON; {voltage, loss, v_poi: {beta, H_<bus>: derivative}} where asked for).
                Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in
                says what failed: 'grid' (no waveform), 'facility' or 'task' (set aside before it ended).
 `waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave,
@@ -37,7 +39,9 @@ binding and
                ac_v_min_pu, ac_v_error_pu, ac_status; replayed (1 once every run of it was made), passed,
                worst_voltage_margin_pu, worst_loss_margin_mw, aggregate_loss_mw, worst {voltage, loss,
                aggregate: where; reactive: {plan, unhosted: units beyond their reactive limits in the AC power
-               flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed.
+               flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed; search (JSON),
+               of method 'frontier', how it was found: candidates, refused, gap, settled, by_sequence, margins
+               (that bind: period, fault, site, target, label, price, by_beta, mechanism).
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
                (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
                unit, studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
@@ -64,7 +68,7 @@ from dcvrt.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 2
+VERSION = 3
 """Of the tables below; a store of another version is refused."""
 
 TABLES = {
@@ -78,7 +82,7 @@ TABLES = {
     "mode TEXT NOT NULL, beta REAL NOT NULL, h_mw REAL, p_mw REAL, v_margin_pu REAL, loss_margin_share REAL, "
     "loss_margin_mw REAL, loss_share REAL, loss_mw REAL, v_poi_min_pu REAL, status TEXT NOT NULL, "
     "ok INTEGER NOT NULL, failed_in TEXT NOT NULL, sequence TEXT NOT NULL, battery INTEGER NOT NULL, "
-    "diagnostics TEXT NOT NULL, "
+    "diagnostics TEXT NOT NULL, gradients TEXT NOT NULL DEFAULT '{}', "
     "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "waveforms": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
     "mode TEXT NOT NULL, beta REAL NOT NULL, signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT "
@@ -102,13 +106,25 @@ TABLES = {
     "ac_v_min_pu REAL, ac_v_error_pu REAL, ac_status TEXT, replayed INTEGER NOT NULL DEFAULT 0, passed "
     "INTEGER, "
     "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
-    "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (method, mode, beta)",
+    "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, "
+    "search TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (method, mode, beta)",
     "what_ifs": "mode TEXT NOT NULL, number INTEGER NOT NULL, label TEXT NOT NULL, changes TEXT NOT NULL, "
     "method TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
     "n_waveforms INTEGER NOT NULL, low REAL NOT NULL, high REAL NOT NULL, rating REAL, "
     "PRIMARY KEY (mode, number)",
 }
-JSON_COLUMNS = {"by_site", "binding", "closed", "slopes", "unknown", "diagnostics", "worst", "changes"}
+JSON_COLUMNS = {
+    "by_site",
+    "binding",
+    "closed",
+    "slopes",
+    "unknown",
+    "diagnostics",
+    "gradients",
+    "worst",
+    "search",
+    "changes",
+}
 
 
 class Store:
@@ -280,13 +296,17 @@ class Store:
         """Every hosting vector: samples and plans."""
         return self._frame("hostings", order="role DESC, name")
 
-    def margins(self, role: str | None = None) -> pd.DataFrame:
-        """Every checked facility run; `role` 'sample' or 'plan' takes those of such hosting vectors only."""
-        where = "" if role is None else "WHERE hosting IN (SELECT name FROM hostings WHERE role = ?)"
+    def margins(self, role: str | None = None, hosting: str | None = None) -> pd.DataFrame:
+        """Every checked facility run; of hosting vectors of a role only, or of one vector."""
+        conditions = {
+            "hosting IN (SELECT name FROM hostings WHERE role = ?)": role,
+            "hosting = ?": hosting,
+        }
+        given = {text: value for text, value in conditions.items() if value is not None}
         return self._frame(
             "margins",
-            where,
-            () if role is None else (role,),
+            f"WHERE {' AND '.join(given)}" if given else "",
+            tuple(given.values()),
             order="hosting, period, fault, site, mode, beta",
         )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, outputs, phases, what_if
+from dcvrt.studies import checks, config, frontier, outputs, phases, what_if
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
@@ -127,7 +127,9 @@ class Study:
                     lost = phases.run_samples(campaign, setting)
                     fits = phases.run_fits(store, setting)
                     phases.run_plans(store, setting, fits, reporter)
+                    lost += frontier.run_frontier(campaign, setting, reporter)
                     lost += phases.run_replays(campaign, setting)
+                    frontier.run_mechanisms(store, setting)
                     what_if.run_what_ifs(store, setting, reporter)
                 finally:
                     store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
@@ -181,7 +183,8 @@ class Study:
                 quick=quick,
                 versions=versions(),
                 platform=platform.platform(),
-                engine=file.grid.engine,
+                engine=file.replay.engine,
+                sampling_engine=file.grid.engine,
                 seed=file.study.seed,
                 periods=setting.periods,
                 criteria=phases.criteria(file),
@@ -253,6 +256,19 @@ class Result:
         found: dict[str, Any] = json.loads((self.folder / outputs.SUMMARY).read_text(encoding="utf-8"))
         return found
 
+    def closed(self) -> list[str]:
+        """Why sites are closed at the highest rating of each mode, by the last method of the study."""
+        rows = self.summary["rows"]
+        last: dict[str, dict[str, Any]] = {}
+        for row in sorted(rows, key=lambda row: (row["beta"], row["method"] == frontier.METHOD)):
+            last[row["mode"]] = row
+        return [
+            f"{mode}, beta {row['beta']:g}, bus {entry['bus']}: {entry['label']}"
+            for mode, row in last.items()
+            for entry in row["binding"]
+            if entry["kind"] == "closed"
+        ]
+
     def table(self) -> pd.DataFrame:
         """One row per plan: capacities, replay and power-flow verdicts."""
         with Store(self.folder / outputs.STORE) as store:
@@ -303,8 +319,11 @@ def prepare(file: StudyFile, setting: phases.Setting) -> dict[str, str]:
     for mode in file.facility.modes:
         runs = [(mode, beta) for beta in file.facility.beta]
         for period in setting.periods:
-            request = setting.request([0.0] * len(setting.sites), period, runs, keep=False)
-            backends[mode] = replay.prepare(request)
+            zero = [0.0] * len(setting.sites)
+            if file.frontier.search:
+                replay.prepare(setting.request(zero, period, runs, engine=file.grid.engine, gradients=True))
+            for engine in (file.grid.engine, file.replay.engine):
+                backends[mode] = replay.prepare(setting.request(zero, period, runs, engine=engine))
     return backends
 
 

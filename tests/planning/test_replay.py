@@ -14,6 +14,7 @@ REQUEST = {
     "period": {"name": "peak"},
     "runs": [["gfl", 1.2]],
     "faults": [{"bus": 32, "t_clear_ms": 100.0}, {"bus": 34, "t_clear_ms": 83.3}],
+    "gradients": False,
 }
 H = {21: 30.0, 75: 0.0}
 
@@ -122,9 +123,10 @@ def test_rows_keep_the_loading_before_the_fault() -> None:
     from dcvrt import Waveform
 
     sag = Waveform.sag(retained=0.8, start=0.1, length=0.1, until=0.4)
-    request = {"parameters": {}, "pf": 0.98, "criteria": {}}
+    request = {"parameters": {}, "pf": 0.98, "criteria": {}, "gradients": False}
     ratings = [1.01, 1.2]
-    rows = _facility_rows(request, "peak", "bus 32, 100 ms", "gfl", ratings, {21: sag}, {21: 30.0}, 1.0)
+    waveforms = {"bus 32, 100 ms": {21: sag}}
+    rows = _facility_rows(request, "peak", "gfl", ratings, waveforms, {21: 30.0}, 1.0)
     preload = [r["diagnostics"]["preload"] for r in rows]
     assert preload[0] == pytest.approx(1.0, abs=1e-3)  # 1/0.98 would be needed
     assert preload[1] == pytest.approx(1 / (0.98 * 1.2), rel=1e-4)

@@ -139,7 +139,7 @@ def make(
             store.put(
                 "hostings",
                 [
-                    phases._hosting(
+                    phases.hosting_row(
                         key,
                         "sample",
                         "fit" if samples.fit[k] else "validation",
@@ -250,7 +250,7 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
                 )
     for plan in plans:
         by_site = {int(b): mw for b, mw in plan["by_site"].items()}
-        store.put("hostings", [phases._hosting(plan["hosting"], "plan", "", by_site)])
+        store.put("hostings", [phases.hosting_row(plan["hosting"], "plan", "", by_site)])
         if plan["method"] == "none":
             store.put("plans", [plan])
             continue
@@ -318,7 +318,7 @@ def _plan(
         "method": method,
         "mode": mode,
         "beta": beta,
-        "hosting": phases._plan_name(H),
+        "hosting": phases.plan_name(H),
         "total_mw": sum(H.values()),
         "by_site": H,
         "binding": binding,

@@ -90,7 +90,7 @@ def test_power_flow_writes_the_excess_and_the_replay_keeps_it(folder: Path) -> N
         reactive=HOSTED,
         reactive_unhosted=UNHOSTED,
     )
-    row = phases._ac(SimpleNamespace(check_ac=lambda plan: verdict), None)  # type: ignore[arg-type]
+    row = phases.power_flow(SimpleNamespace(check_ac=lambda plan: verdict), None)  # type: ignore[arg-type]
     change(folder, **row, replayed=0)
     setting = SimpleNamespace(
         file=study_file("again"), sites=SITES, periods=PERIODS, request=lambda *_, **__: {}

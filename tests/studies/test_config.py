@@ -83,7 +83,7 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
     assert complaint(text) == (
         "my.toml: 7 problems\n"
         "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
-        "sampling, surrogate, run, "
+        "sampling, surrogate, frontier, replay, run, "
         "fault, period, what_if.\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
         "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "

@@ -150,6 +150,12 @@ def test_what_is_refused_before_the_first_task_leaves_no_folder(
 
 def test_values_that_no_run_takes_are_refused_before_the_first_task(tmp_path: Path) -> None:
     request = {
+        "case": "ieee118",
+        "dynamics": None,
+        "sites": [21],
+        "redispatch": "proportional",
+        "engine": "native",
+        "gradients": False,
         "runs": [["gfl", 1.0], ["gfl", 9.0]],
         "parameters": {},
         "period": {"dc_factor": 0.05},
@@ -254,7 +260,9 @@ def check_summary(summary: dict) -> None:
         assert row["total_mw"] == pytest.approx(sum(row["by_site"].values()))
         assert row["total_mw"] <= summary["no_vrt"]["total_mw"] + 1e-3
         totals.setdefault((row["method"], row["mode"]), []).append(row["total_mw"])
-    for values in totals.values():
+    for (method, _), values in totals.items():
+        if method == "frontier":  # more rating can cost margin in grid-forming mode, and the search sees it
+            continue
         assert all(b >= a - 1e-6 for a, b in itertools.pairwise(values))
     for row in summary["surrogate"]:
         assert set(row) == {

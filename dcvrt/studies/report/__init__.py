@@ -11,13 +11,14 @@ from string import Template
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
-from dcvrt.studies.report import answer, checks, grid, hypotheses, models, plans, record, what_if
+from dcvrt.studies.report import answer, checks, frontier, grid, hypotheses, models, plans, record, what_if
 from dcvrt.studies.report.page import Safe, escape
 
 REPORT = "report.html"
 
 SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     answer.answer,
+    frontier.frontier,
     plans.plans,
     plans.failures,
     plans.closed_sites,

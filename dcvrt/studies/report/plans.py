@@ -23,6 +23,7 @@ from dcvrt.studies.style import mode_name
 METHODS = {
     "paper": "the paper's fit: margins in MW over load and rating, one fit for all ratings and periods",
     "share": "margins in pu volts and as a share of import, fitted at each rating",
+    "frontier": "exact margins with gradients at the candidates themselves, outside the sampled box too",
 }
 
 

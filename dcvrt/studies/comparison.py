@@ -1,0 +1,108 @@
+"""The paper's method and the frontier on the same study, side by side, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dcvrt.studies.store import Store, records
+
+PAPER, FRONTIER = "paper", "frontier"
+
+
+def comparison(store: Store) -> dict[str, Any]:
+    """What the two methods host at every mode and rating, and what each spent.
+
+    Returns
+    -------
+    dict
+        `rows`: mode, beta, and for each method total_mw, by_site, passed (the replay; None where nothing is
+        hosted), false_pass (it hosts something and failed) and closed; gain_mw: what the frontier hosts beyond
+        the paper's method, None where the plan of either failed; of the frontier: margins (what binds),
+        by_sequence, candidates, refused, gap, settled.
+        `simulations`: by role of the hosting vector (`paper`: the samples of the fits; `frontier`: samples
+        and candidates of the search; `replay`: both methods' replays), fault simulations and facility runs,
+        with gradients or without, and how many failed.
+        `ratio`: fault simulations of the search over those of the paper's sampling.
+        `hidden`: sentences on capacity that passed the replay and that the paper's fits did not allow.
+    """
+    plans = {(p["method"], p["mode"], p["beta"]): p for p in records(store.plans())}
+    runs = [(mode, beta) for method, mode, beta in plans if method == FRONTIER]
+    rows = [
+        _row(plans[PAPER, mode, beta], plans[FRONTIER, mode, beta])
+        for mode, beta in runs
+        if (PAPER, mode, beta) in plans
+    ]
+    spent = _simulations(store)
+    paper, search = spent["paper"]["grid"], spent["frontier"]["grid"]
+    return {
+        "rows": rows,
+        "simulations": spent,
+        "ratio": search / paper if paper else None,
+        "hidden": [text for row in rows if (text := _hidden(row))],
+    }
+
+
+def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any]:
+    row: dict[str, Any] = {"mode": frontier["mode"], "beta": frontier["beta"]}
+    for name, plan in ((PAPER, paper), (FRONTIER, frontier)):
+        hosts = plan["total_mw"] > 0
+        row[name] = {
+            "total_mw": plan["total_mw"],
+            "by_site": plan["by_site"],
+            "passed": bool(plan["passed"]) if hosts else None,
+            "false_pass": bool(hosts and not plan["passed"]),
+            "closed": plan["closed"],
+        }
+    search = frontier["search"]
+    equal = not row[PAPER]["false_pass"] and not row[FRONTIER]["false_pass"]
+    row["gain_mw"] = frontier["total_mw"] - paper["total_mw"] if equal else None
+    return row | {
+        name: search.get(name)
+        for name in ("margins", "by_sequence", "candidates", "refused", "gap", "settled")
+    }
+
+
+def _simulations(store: Store) -> dict[str, dict[str, int]]:
+    margins = store.margins()
+    role = dict(zip(store.hostings().name, store.hostings().role, strict=True))
+    kinds = {"sample": "paper", "search": "frontier", "candidate": "replay", "plan": "replay"}
+    margins = margins.assign(kind=[kinds[role[name]] for name in margins.hosting])
+    spent = {}
+    for kind in ("paper", "frontier", "replay"):
+        here = margins[(margins.kind == kind) & (margins.failed_in != "task")]
+        faults = here.drop_duplicates(["hosting", "period", "fault"])
+        ran = here[here.failed_in != "grid"]
+        spent[kind] = {
+            "grid": len(faults),
+            "grid_with_gradients": len(faults) if kind == "frontier" else 0,
+            "grid_failed": int((faults.failed_in == "grid").sum()),
+            "facility": len(ran),
+            "facility_with_gradients": len(ran) if kind == "frontier" else 0,
+            "facility_failed": int((ran.failed_in == "facility").sum()),
+        }
+    return spent
+
+
+def _hidden(row: Mapping[str, Any]) -> str:
+    """A sentence where the paper's fits did not allow what passes the replay; empty elsewhere."""
+    paper, frontier = row[PAPER], row[FRONTIER]
+    gain = frontier["total_mw"] - paper["total_mw"]
+    if not frontier["passed"] or not gain > 0.005 * frontier["total_mw"]:
+        return ""
+    shut = [bus for bus in paper["closed"] if frontier["by_site"][bus] > 0]
+    sites = f", closing bus {', '.join(shut)}" if shut else ""
+    return (
+        f"{row['mode']}, beta {row['beta']:g}: {frontier['total_mw']:.1f} MW pass the replay; the paper's "
+        f"fits allow {paper['total_mw']:.1f} MW{sites}. The {gain:.1f} MW between are an effect of the fit, "
+        "not of the system."
+    )
+
+
+def buses(by_site: Mapping[str, float]) -> str:
+    """Open sites with their capacities, in words.
+
+    >>> buses({"21": 0.0, "75": 145.7})
+    '75: 145.7'
+    """
+    return ", ".join(f"{bus}: {mw:.1f}" for bus, mw in by_site.items() if mw > 0) or "–"

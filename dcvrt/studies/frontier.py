@@ -1,0 +1,186 @@
+"""The frontier of a study: searched with the engine of the samples, replayed with that of the plans."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from dcvrt.planning import replay
+from dcvrt.planning.exact import Exact, Run, exact_of
+from dcvrt.planning.frontier import Ask, Found, Options, frontiers
+from dcvrt.planning.mechanism import mechanism
+from dcvrt.planning.sampling import sample_hosting
+from dcvrt.studies import phases
+from dcvrt.studies.campaign import Campaign
+from dcvrt.studies.phases import FRONTIER, REPLAYS, Job, Setting
+from dcvrt.studies.store import Store, records
+from dcvrt.waveform import Waveform
+
+METHOD = "frontier"
+"""Method of the plans that the frontier finds."""
+
+
+def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[str]:
+    """Search the frontier of every mode and rating and write its plans; messages of what was set aside.
+
+    The search is made again when anything that it was made from has changed since; what it has simulated
+    before is read from the store.
+    """
+    if not setting.file.frontier.search:
+        return []
+    store = campaign.store
+    if store.provenance().get("frontier_from") == _state(store):
+        return []
+    asked = _Campaign(campaign, setting)
+    f = setting.file.frontier
+    found = frontiers(
+        setting.problem,
+        setting.runs,
+        setting.problem.upper,
+        coarse_samples(setting),
+        [(period, label) for period in setting.periods for label in asked.labels],
+        asked.simulate,
+        asked.replay,
+        Options(gain=f.gain, trust=f.trust, candidates=f.candidates),
+        lambda ended, total: progress("frontier", ended, total, 0),
+    )
+    rows = [_plan_row(setting, one) for one in found]
+    checked: dict[str, dict[str, Any]] = {}
+    for row, one in zip(rows, found, strict=True):
+        if row["hosting"] not in checked:
+            checked[row["hosting"]] = phases.power_flow(setting.problem, one.plan)
+        row |= checked[row["hosting"]]
+    with store.transaction():
+        store.put("hostings", [phases.plan_hosting(row) for row in rows])
+        store.put("plans", rows)
+        store.note(frontier_from=_state(store))
+    return asked.lost
+
+
+def coarse_samples(setting: Setting) -> Any:
+    """The plan without ride-through first, next to nothing second, then a space-filling sequence between
+    them."""
+    corner = [setting.no_vrt.by_site[bus] for bus in setting.sites]
+    n = setting.file.frontier.samples
+    return sample_hosting(corner, max(n, 4), setting.file.study.seed, high_share=0.0).hosting[:n]
+
+
+def run_mechanisms(store: Store, setting: Setting) -> None:
+    """Find out what is active at the margins that bind the plans of the frontier, from their replayed
+    voltages."""
+    for plan in records(store.plans()):
+        margins = plan["search"].get("margins", [])
+        if plan["method"] != METHOD or not margins:
+            continue
+        told = [item | {"mechanism": _mechanism(store, setting, plan, item)} for item in margins]
+        with store.transaction():
+            store.put("plans", [plan | {"search": plan["search"] | {"margins": told}}])
+
+
+def _mechanism(store: Store, setting: Setting, plan: Mapping[str, Any], item: Mapping[str, Any]) -> str:
+    place = {name: item[name] for name in ("period", "fault", "site")}
+    kept = store.waveforms(hosting=plan["hosting"], mode="", **place)
+    if not kept:
+        return "not known: the replay has no waveform"
+    _, signals = kept[0]
+    waveform = Waveform(signals["t_s"].astype(np.float64), signals["v_re_pu"] + 1j * signals["v_im_pu"])
+    file, mode, target = setting.file, plan["mode"], item["target"]
+    simulator = replay.simulator_of(
+        mode, file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
+    )
+    run = simulator.attempt(
+        waveform, H=1.0, beta=plan["beta"], d=setting.d[item["period"]], pf=file.hosting.pf
+    )
+    margins = store.margins(hosting=plan["hosting"])
+    here = margins[
+        (margins["mode"] == mode)
+        & (margins.beta == plan["beta"])
+        & np.logical_and.reduce([margins[name] == value for name, value in place.items()])
+    ]
+    if not run.completed or here.empty or not here.ok.iloc[0]:
+        return "not known: the run has no result"
+    window = 1e-3 * (file.criteria.loss_window_ms if target == "loss" else file.criteria.window_ms)
+    modes = next(a.modes for a in simulator.dae.automata if a.path == "sup")
+    return mechanism(run, modes, target, here.diagnostics.iloc[0][f"{target}_time"], window)
+
+
+def _state(store: Store) -> str:
+    """Digest of what a frontier is made from: its tasks with their states, and the plans of the other
+    methods."""
+    tasks = [(t["hash"], t["status"]) for t in records(store.tasks()) if t["phase"] in (FRONTIER, REPLAYS)]
+    found = [p["hosting"] for p in records(store.plans()) if p["method"] == METHOD]
+    return hashlib.sha256(json.dumps([sorted(tasks), found]).encode()).hexdigest()
+
+
+def _plan_row(setting: Setting, found: Found) -> dict[str, Any]:
+    row = phases.plan_row(setting, METHOD, found.mode, found.beta, found.plan, found.closed, None)
+    return row | {
+        "search": {
+            "candidates": found.candidates,
+            "refused": found.failed,
+            "gap": found.gap,
+            "settled": found.settled,
+            "by_sequence": list(found.by_sequence),
+            "margins": [asdict(margin) for margin in found.binding],
+        }
+    }
+
+
+class _Campaign:
+    """Answers the questions of the searches by tasks of a campaign."""
+
+    def __init__(self, campaign: Campaign, setting: Setting) -> None:
+        self.campaign, self.setting = campaign, setting
+        self.labels = [replay.fault_label(fault.model_dump()) for fault in setting.file.fault]
+        self.lost: list[str] = []
+
+    def simulate(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[Mapping[Run, Sequence[Exact]]]:
+        setting, store = self.setting, self.campaign.store
+        engine = setting.file.grid.engine
+        jobs = []
+        for ask, runs in questions:
+            self._enter(ask, "f", "search")
+            for period in setting.periods:
+                faults = [fault for p, fault in ask.places or () if p == period]
+                if faults:
+                    request = setting.request(
+                        ask.H, period, runs, engine=engine, gradients=True, faults=faults
+                    )
+                    jobs.append(Job(self._name(ask, "f"), request))
+        self.lost += phases.simulate(self.campaign, FRONTIER, jobs)
+        answers: list[Mapping[Run, Sequence[Exact]]] = []
+        for ask, runs in questions:
+            rows = records(store.margins(hosting=self._name(ask, "f")))
+            wanted = {(*run, *place) for run in runs for place in ask.places or ()}
+            here = [r for r in rows if (r["mode"], r["beta"], r["period"], r["fault"]) in wanted]
+            answers.append(exact_of(here, setting.sites, ask.H))
+        return answers
+
+    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[list[dict[str, Any]]]:
+        store = self.campaign.store
+        for ask, _ in questions:
+            self._enter(ask, "p", "candidate")
+        plans = [(self._name(ask, "p"), ask.H, list(runs)) for ask, runs in questions]
+        self.lost += phases.replay_plans(self.campaign, self.setting, plans)
+        return [
+            [row for row in records(store.margins(hosting=name)) if (row["mode"], row["beta"]) in runs]
+            for name, _, runs in plans
+        ]
+
+    def _by_site(self, ask: Ask) -> dict[str, float]:
+        return dict(zip(map(str, self.setting.sites), ask.H, strict=True))
+
+    def _name(self, ask: Ask, kind: str) -> str:
+        return kind + phases.plan_name(self._by_site(ask))[1:]
+
+    def _enter(self, ask: Ask, kind: str, role: str) -> None:
+        """Enter a hosting vector, unless a plan has entered it."""
+        store, name = self.campaign.store, self._name(ask, kind)
+        if name not in set(store.hostings().name):
+            by_site = {int(bus): mw for bus, mw in self._by_site(ask).items()}
+            store.put("hostings", [phases.hosting_row(name, role, "", by_site)])

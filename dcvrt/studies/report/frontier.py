@@ -1,0 +1,97 @@
+"""The page that puts the paper's method and the frontier side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dcvrt.studies.comparison import buses
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.report.page import Safe, badge, bullets, escape, number, paragraph, section, table
+from dcvrt.studies.style import mode_name
+
+
+def frontier(findings: Findings) -> Safe:
+    """Capacities, verdicts, simulations and what binds of both methods; nothing where none was searched."""
+    found = findings.comparison
+    if not found["rows"]:
+        return Safe("")
+    spent, head = (
+        found["simulations"],
+        ["fault simulations", "of them failed", "facility runs", "of them failed"],
+    )
+    fields = ("grid", "grid_failed", "facility", "facility_failed")
+    names = {
+        "paper": "samples of the paper's method",
+        "frontier": "search of the frontier, all with gradients",
+        "replay": "replays of both methods",
+    }
+    false = [row for row in found["rows"] if row["paper"]["false_pass"]]
+    ratio = found["ratio"]
+    unsettled = [row for row in found["rows"] if not row["settled"]]
+    sequence = list(dict.fromkeys(text for row in found["rows"] for text in row["by_sequence"]))
+    return section(
+        "Paper's method and frontier",
+        paragraph(
+            "The paper's method fits affine margins to samples, lowers them by their largest error and keeps "
+            "plans to the sampled box. The frontier simulates its own candidates, with the derivative of every "
+            "margin by every site's capacity, cuts off what fails, and ends when nothing is left to gain. Both "
+            "are replayed in the same way."
+        ),
+        table(
+            "Both methods at every mode and rating",
+            ["mode", "β", "paper (MW)", "sites (MW)", "replay", "frontier (MW)", "sites (MW)", "replay",
+             "gain (MW)",
+             "what binds the frontier"],
+            [_cells(row) for row in found["rows"]],
+            words=[3, 6, 9],
+        ),
+        paragraph(
+            f"False passes of the paper's fits: {len(false)}. "
+            + (
+                ""
+                if ratio is None
+                else f"The search spent {ratio:.3f} times the fault simulations of the paper's sampling, for "
+                "all modes and ratings together."
+            )
+        ),
+        table("Simulations spent", ["for", *head], [
+            [names[kind], *[str(spent[kind][field]) for field in fields]] for kind in names
+        ]),
+        paragraph("Capacity that the fits hid:" if found["hidden"] else "The fits hid no capacity."),
+        *([bullets(found["hidden"])] if found["hidden"] else []),
+        *(
+            [
+                paragraph("Limits set by bisection, on the safe side of a change of the event sequence:"),
+                bullets(sequence),
+            ]
+            if sequence
+            else [paragraph("No limit had to be set by bisection at a change of the event sequence.")]
+        ),
+        *(
+            [paragraph("Searches that ended before nothing was left to gain: "
+                       + ", ".join(f"{row['mode']} at β {row['beta']:g}" for row in unsettled) + ".")]
+            if unsettled
+            else []
+        ),
+    )  # fmt: skip
+
+
+def _cells(row: Mapping[str, Any]) -> list[object]:
+    cells: list[object] = [mode_name(row["mode"]), f"{row['beta']:g}"]
+    for method in ("paper", "frontier"):
+        found = row[method]
+        verdict = {True: "passed", False: "failed", None: "nothing hosted"}[found["passed"]]
+        cells += [number(found["total_mw"], 2), buses(found["by_site"]), badge(verdict)]
+    return [*cells, "–" if row["gain_mw"] is None else number(row["gain_mw"], 2), _binding(row)]
+
+
+def _binding(row: Mapping[str, Any]) -> Safe:
+    lines = [
+        f"{item['target']} at bus {item['site']}, fault {item['fault']}, {item['period']}: "
+        f"{item.get('mechanism', 'mechanism not known')}; {0.01 * item['by_beta']:+.1f} MW per 0.01 of β"
+        for item in row["margins"]
+    ]
+    shut = row["frontier"]["closed"]
+    lines += [f"bus {bus} closed: {why}" for bus, why in shut.items()]
+    return Safe("<br>".join(escape(line) for line in lines or ["the network alone"]))
