@@ -6,8 +6,12 @@ the ends of its stretches and judges nothing. README.md in this folder says how 
 
 from __future__ import annotations
 
+import os
+import platform
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +25,7 @@ from benchmarks.baselines.generated import Generated, tabled
 from benchmarks.harness import Result, least, result
 from dcvrt import Criteria, Waveform, facility
 from dcvrt.dae import Dae
-from dcvrt.integrators import Casadi, Simulator
+from dcvrt.integrators import Casadi, Kernel, Simulator, find_compiler
 from dcvrt.integrators.equations import Equations
 
 RUNS = 1000
@@ -31,6 +35,8 @@ TARGETS = (1e-4, 1e-5)
 TARGETS_SENSITIVITIES = (1e-3,)
 SAMPLED = 5e-3
 SEED = 1
+LANED = 200
+"""Runs on sampled waveforms in one batch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +82,7 @@ def run(smoke: bool) -> list[Result]:
         dae = getattr(facility, mode)().compile()
         rows += ensembles(mode, dae, smoke)
         if not smoke:
+            rows += widths(mode, dae)
             rows += sampled(mode, dae)
     return rows
 
@@ -101,6 +108,7 @@ def ensembles(mode: str, dae: Dae, smoke: bool) -> list[Result]:
     others = [
         generated_curve(f"{who}, ends only", *given),
         generated_curve(f"{who}, {POINTS} samples a stretch", *given, POINTS),
+        generated_curve(f"{who}, {POINTS} samples a stretch, looks at guards", *given, POINTS, watching=True),
     ]
     ours = ours_on(dae, ensemble, small, checked, (), targets)
     rows = compare(name, "a run with events and margins", ours, others, targets)
@@ -145,10 +153,10 @@ def without_sensitivities(case: Case, plain: Equations) -> Case:
 
 def generated_curve(
     name: str, equations: Equations, cases: Sequence[Case], checked: int, targets: Sequence[float],
-    which: int, points: int = 1, forward: bool = False,
+    which: int, points: int = 1, forward: bool = False, watching: bool = False,
 ) -> Curve:  # fmt: skip
     """Generated C in a loop in C; seconds are per run. `which`: 0 path error, 1 sensitivity error."""
-    timed = Generated(equations, "erk", points, forward)
+    timed = Generated(equations, "erk", points, forward, watching=watching)
     fine = timed if points == POINTS else Generated(equations, "erk", POINTS, forward)
     given = timed.arguments(cases)
     some = fine.arguments(cases[:checked])
@@ -199,6 +207,82 @@ def ours_on(
     return found
 
 
+# -- lanes and threads --------------------------------------------------------------------------------------
+
+
+def widths(mode: str, dae: Dae) -> list[Result]:
+    """The ensemble on fewer lanes, and on two threads (wall time: only there do other processors help)."""
+    ensemble, rtol = draw(RUNS), 1e-6
+    name = f"{mode}, {RUNS} runs of {ensemble.waveforms[0].until:g} s, rtol {rtol:g}"
+    metric = "a run with events and margins"
+
+    def batch(threads: int = 1) -> Callable[[], object]:
+        simulate = Simulator(dae, Kernel("dp5", rtol, rtol * 1e-2, threads=threads))
+        return lambda: simulate.batch(ensemble.waveforms, ensemble.table, criteria=Criteria())
+
+    if find_compiler() is None:
+        return []
+    native, rows = least(batch(), 2.0) / RUNS, []
+    for march in ("x86-64-v3", "x86-64") if platform.machine() == "x86_64" else ():
+        with instructions(march):
+            fewer = least(batch(), 2.0) / RUNS
+        rows.append(
+            result(name, f"{metric}, all instructions", 1e3 * native, "ms", f"with {march}", 1e3 * fewer)
+        )
+    with every_processor() as processors:
+        if processors > 1:
+            took = [_wall(batch(threads)) / RUNS for threads in (2, 1)]
+            rows.append(
+                result(
+                    name,
+                    f"{metric}, two threads, wall",
+                    1e3 * took[0],
+                    "ms",
+                    "one thread, wall",
+                    1e3 * took[1],
+                )
+            )
+    return rows
+
+
+def _wall(call: Callable[[], object]) -> float:
+    """Least wall time of three calls."""
+    call()
+    took = []
+    for _ in range(3):
+        start = time.perf_counter()
+        call()
+        took.append(time.perf_counter() - start)
+    return min(took)
+
+
+@contextmanager
+def instructions(march: str) -> Iterator[None]:
+    """Compile for other instructions than this processor's."""
+    before = os.environ.get("DCVRT_MARCH")
+    os.environ["DCVRT_MARCH"] = march
+    try:
+        yield
+    finally:
+        os.environ.pop("DCVRT_MARCH")
+        if before is not None:
+            os.environ["DCVRT_MARCH"] = before
+
+
+@contextmanager
+def every_processor() -> Iterator[int]:
+    """Let this process use all processors; yields their number."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield os.cpu_count() or 1
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    try:
+        yield len(os.sched_getaffinity(0))
+    finally:
+        os.sched_setaffinity(0, before)
+
+
 # -- a sampled waveform -----------------------------------------------------------------------------------
 
 
@@ -213,7 +297,9 @@ def sampled(mode: str, dae: Dae) -> list[Result]:
     name = f"{mode}, {wave.until:g} s, a sample every {1e3 * SAMPLED:g} ms, rtol {rtol:g}"
     rows = []
 
-    def row(who: str, on_steps: Callable[[], object], on_samples: Callable[[], object], error: float) -> None:
+    def row(
+        who: str, on_steps: Callable[[], object], on_samples: Callable[[], object], error: float | None
+    ) -> None:
         a, b = least(on_steps), least(on_samples)
         rows.append(
             result(
@@ -226,6 +312,16 @@ def sampled(mode: str, dae: Dae) -> list[Result]:
         other = Simulator(dae, options(rtol), save_at=wave.until)
         error = stepped.reference.of(other.attempt(dense, **values))[0]
         row(who, lambda s=simulate: s(wave, **values), lambda s=other: s(dense, **values), error)
+    for who, options in _ours.solvers().items():
+        ensemble, simulate = draw(LANED), Simulator(dae, options(rtol))
+        fine_waves = [w.resampled(SAMPLED) for w in ensemble.waveforms]
+
+        def batch(
+            waves: Sequence[Waveform], s: Simulator = simulate, table: dict[str, list[float]] = ensemble.table
+        ) -> Callable[[], object]:
+            return lambda: s.batch(waves, table, criteria=Criteria())
+
+        row(f"{who}, batch of {LANED}", batch(ensemble.waveforms), batch(fine_waves), None)
 
     eq = stepped.equations
     plain, seen = Generated(eq, "erk", 1), Generated(eq, "erk", 4)

@@ -61,6 +61,12 @@ def baselines(case: Case, targets: tuple[float, ...], smoke: bool) -> Any:
             lambda: generated.single(eq, "erk", case),
             TOLERANCES,
         ),
+        (
+            "CasADi erk, generated C, looks at guards",
+            "CasADi, generated C",
+            lambda: generated.single(eq, "erk", case, watching=True),
+            TOLERANCES,
+        ),
         ("CasADi cvodes, interpreted", "CasADi", lambda: interpreted.make(case, "cvodes", True), TOLERANCES),
     ]
     if not smoke:

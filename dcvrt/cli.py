@@ -260,7 +260,9 @@ def facility_list() -> None:
 
     from dcvrt import facility as variants
 
-    shown = Table("name", "what it is", "states", "modes", box=box.SIMPLE_HEAD, show_edge=False)
+    shown = Table(
+        "name", "what it is", "states", "modes", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+    )
     for name in variants.names():
         diagram = variants.get(name)
         dae = diagram.compile()
@@ -289,7 +291,7 @@ def facility_sheet(
     from dcvrt.models.sheet_forms import terminal
 
     console = _console()
-    for part in terminal(contents(diagram)):
+    for part in terminal(contents(diagram), console.width):
         console.print(part)
 
 

@@ -15,7 +15,7 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.errors import InputError, did_you_mean, outside
+from dcvrt.errors import InputError, did_you_mean, raise_all, refusal
 
 if TYPE_CHECKING:
     from dcvrt.linear import Linear, OperatingPoint
@@ -87,6 +87,25 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Tied:
+    """A number that follows from the parameters and has a range of its own.
+
+    A parameter of a block that is bound to an expression, or a dwell time.
+
+    Attributes
+    ----------
+    what : what it is, as messages name it.
+    unit, bounds : its unit, and the range in which it must lie.
+    value : SX expression of the parameters.
+    """
+
+    what: str
+    unit: str
+    bounds: tuple[float, float]
+    value: ca.SX
+
+
+@dataclass(frozen=True)
 class Automaton:
     """Modes, the flags each mode sets, and the rows that lead from one to another, tried top to bottom.
 
@@ -133,6 +152,7 @@ class Dae:
     start : SX column of `x` then `z`, start values as functions of `p` and `u` for the search of the
         equilibrium (a guess, not the equilibrium itself).
     notes : deviations from the paper, one line each ('path: text').
+    tied : what follows from the parameters and must stay within a range of its own.
     """
 
     name: str
@@ -152,6 +172,7 @@ class Dae:
     automata: tuple[Automaton, ...] = ()
     start: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     notes: tuple[str, ...] = ()
+    tied: tuple[Tied, ...] = ()
 
     @property
     def parameters(self) -> ParameterTable:
@@ -168,19 +189,23 @@ class Dae:
         """Clocks of all automata, stacked."""
         return ca.vertcat(*[a.clock for a in self.automata]) if self.automata else ca.SX(0, 1)
 
-    @property
+    @cached_property
     def x_names(self) -> tuple[str, ...]:
         return tuple(r.path for r in self.states)
 
-    @property
+    @cached_property
+    def z_names(self) -> tuple[str, ...]:
+        return tuple(r.path for r in self.algebraics)
+
+    @cached_property
     def p_names(self) -> tuple[str, ...]:
         return tuple(r.path for r in self.parameter_rows)
 
-    @property
+    @cached_property
     def u_names(self) -> tuple[str, ...]:
         return tuple(r.path for r in self.inputs)
 
-    @property
+    @cached_property
     def y_names(self) -> tuple[str, ...]:
         return tuple(r.path for r in self.outputs)
 
@@ -203,9 +228,9 @@ class Dae:
 
     def parameter_number(self, path: str) -> int:
         """Position of the parameter `path` in `p`."""
-        if path not in self.p_names:
+        if path not in self._position:
             raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
-        return self.p_names.index(path)
+        return self._position[path]
 
     def parameter_values(self, **changes: float) -> Array:
         """Values of `p` with some changed; each change is checked against its bounds.
@@ -215,25 +240,48 @@ class Dae:
         Raises
         ------
         InputError
-            unknown names and values outside their bounds, all at once; limits of guards that would leave no
-            hysteresis between two modes.
+            unknown names and values outside their bounds, all at once; bound parameters that they would take
+            outside theirs, and limits of guards that would leave no hysteresis between two modes.
         """
-        values = np.array([r.value for r in self.parameter_rows], dtype=float)
-        problems = []
+        values, problems = self._given.copy(), []
         for path, value in changes.items():
-            if path not in self.p_names:
+            if path not in self._position:
                 problems.append(f"{self.name} has no parameter {path!r}.{did_you_mean(path, self.p_names)}")
                 continue
-            row = self.parameter_rows[self.p_names.index(path)]
-            low, high = row.bounds
-            if not low <= value <= high:
-                problems.append(outside(path, value, row.unit, row.bounds))
+            row = self.parameter_rows[self._position[path]]
+            if problem := refusal(path, value, row.unit, row.bounds):
+                problems.append(problem)
                 continue
-            values[self.p_names.index(path)] = value
-        if changes and not problems:
-            problems = [f"{self.name}: {problem}" for problem in self.chatter(values)]
+            values[self._position[path]] = value
+        if not problems and not self._read_together.isdisjoint(changes):
+            problems = [f"{self.name}: {problem}" for problem in self.conflicts(values)]
         if problems:
             raise InputError("\n".join(problems))
+        return values
+
+    def parameter_cases(self, cases: Sequence[Mapping[str, float]], where: str) -> Array:
+        """:meth:`parameter_values` of many cases that change the same parameters, a row each.
+
+        Raises
+        ------
+        InputError
+            what is wrong with any of the cases, each sentence once; `where` says of what they are cases.
+        """
+        values = np.tile(self._given, (len(cases), 1))
+        paths = list(cases[0]) if cases else []
+        if all(path in self._position for path in paths):
+            at = [self._position[path] for path in paths]
+            values[:, at] = [[case[path] for path in paths] for case in cases]
+            low, high = np.array([self.parameter_rows[k].bounds for k in at]).reshape(-1, 2).T
+            if np.all((values[:, at] >= low) & (values[:, at] <= high)) and self._agree(values):
+                return values
+        problems: dict[str, None] = {}
+        for case in cases:
+            try:
+                self.parameter_values(**case)
+            except InputError as error:
+                problems |= dict.fromkeys(str(error).splitlines())
+        raise_all(list(problems), where)
         return values
 
     def linearise(self, at: OperatingPoint) -> Linear:
@@ -254,10 +302,16 @@ class Dae:
 
         return linearise(self, at)
 
-    def chatter(self, values: Array) -> list[str]:
-        """Pairs of rows between which the parameter values leave no hysteresis, one message each."""
+    def conflicts(self, values: Array) -> list[str]:
+        """What the parameter values, each within its bounds, do together that cannot be: one message each.
+
+        Bound parameters and dwell times outside their range; pairs of rows without hysteresis.
+        """
+        numbers = iter(np.array(self._together(values)).ravel())
         problems = []
-        numbers = iter(np.array(self._gaps(values)).ravel() if self.automata else ())
+        for tied in self.tied:
+            if problem := refusal(tied.what, next(numbers), tied.unit, tied.bounds):
+                problems.append(problem)
         for a in self.automata:
             for gap in a.gaps:
                 width, limits = next(numbers), [(name, next(numbers)) for name, _ in gap.limits]
@@ -270,13 +324,39 @@ class Dae:
                     )
         return problems
 
+    def _agree(self, values: Array) -> bool:
+        """Whether no case, a row each, has any of the `conflicts`."""
+        together = np.array(self._together(values.T))
+        low, high = np.array([tied.bounds for tied in self.tied]).reshape(-1, 2).T[:, :, None]
+        tied = together[: len(self.tied)]
+        sizes = [1 + len(gap.limits) for a in self.automata for gap in a.gaps]
+        widths = together[len(self.tied) + np.cumsum([0, *sizes])[:-1].astype(int)]
+        return bool(np.all((tied >= low) & (tied <= high)) and np.all(widths > 0))
+
     @cached_property
-    def _gaps(self) -> ca.Function:
-        """Width and limits of every gap as a function of the parameters."""
-        rows = [
-            e for a in self.automata for g in a.gaps for e in (g.width, *(limit for _, limit in g.limits))
-        ]
-        return ca.Function("gaps", [self.p], [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
+    def _given(self) -> Array:
+        """Values of `p` as the system has them."""
+        return np.array([r.value for r in self.parameter_rows], dtype=float)
+
+    @cached_property
+    def _position(self) -> dict[str, int]:
+        """Position of every parameter in `p`."""
+        return {path: k for k, path in enumerate(self.p_names)}
+
+    @cached_property
+    def _read_together(self) -> frozenset[str]:
+        """Parameters that the conflicts depend on."""
+        together = self._together(self.p)
+        reads = ca.which_depends(together, self.p, 1) if together.numel() else []
+        return frozenset(path for path, read in zip(self.p_names, reads, strict=False) if read)
+
+    @cached_property
+    def _together(self) -> ca.Function:
+        """What is tied to the parameters, then width and limits of every gap, as a function of them."""
+        gaps = [g for a in self.automata for g in a.gaps]
+        rows = [tied.value for tied in self.tied]
+        rows += [e for g in gaps for e in (g.width, *(limit for _, limit in g.limits))]
+        return ca.Function("together", [self.p], [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
 
 
 def _is_number(text: str) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from numbers import Real
+from typing import Any
 
 
 class DcvrtError(Exception):
@@ -53,6 +55,26 @@ def outside(name: str, value: float, unit: str, bounds: tuple[float, float]) -> 
     """
     measured = f"{value:g}" if unit == "1" else f"{value:g} {unit}"
     return f"{name} = {measured} is outside [{bounds[0]:g}, {bounds[1]:g}]."
+
+
+def is_number(value: object) -> bool:
+    """Whether it is one plain real number: no text, no symbol, no array, no truth value.
+
+    >>> is_number(2), is_number("2"), is_number(True)
+    (True, False, False)
+    """
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def refusal(name: str, value: Any, unit: str, bounds: tuple[float, float]) -> str:
+    """Why something cannot have this value: it is no number, or out of range. An empty text when it can.
+
+    >>> refusal("beta", "1.2", "1", (0.8, 2.0)), refusal("beta", 1.2, "1", (0.8, 2.0))
+    ("beta = '1.2' is not a number.", '')
+    """
+    if not is_number(value):
+        return f"{name} = {value!r} is not a number."
+    return "" if bounds[0] <= value <= bounds[1] else outside(name, value, unit, bounds)
 
 
 def first_sentence(message: str) -> str:

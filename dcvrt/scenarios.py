@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.errors import InputError, did_you_mean, raise_all
+from dcvrt.errors import InputError, did_you_mean, is_number, raise_all
 
 if TYPE_CHECKING:
     from dcvrt.waveform import Waveform
@@ -47,8 +47,10 @@ def _within(where: str, **values: tuple[float, float, float]) -> None:
     raise_all(
         [
             f"{name} = {value:g} must lie in [{low:g}, {high:g}]."
+            if is_number(value)
+            else f"{name} = {value!r} is not a number."
             for name, (value, low, high) in values.items()
-            if not low <= value <= high
+            if not is_number(value) or not low <= value <= high
         ],
         where,
     )
@@ -182,7 +184,11 @@ def frequency_ramp(
     hold, back : time at that frequency, s, and whether it comes back at the same rate.
     """
     where = "frequency-ramp"
-    _within(where, rocof=(abs(rocof), 1e-3, 100.0), deviation=(deviation, 1e-3, 10.0))
+    _within(
+        where,
+        rocof=(abs(rocof) if is_number(rocof) else rocof, 1e-3, 100.0),
+        deviation=(deviation, 1e-3, 10.0),
+    )
     _within(where, hold=(hold, 1e-3, 3600.0))
     away, time = math.copysign(deviation, rocof), deviation / abs(rocof)
     steps: list[Any] = [(0.0, 0.0), (start, 0.0, away), (start + time, away)]

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dcvrt.errors import InputError, did_you_mean, raise_all
-from dcvrt.samples import Pieces, check_samples, cubic_pieces, negative, spans_of_steps
+from dcvrt.samples import Pieces, check_samples, cubic_pieces, gaps, negative, spans_of_steps
 from dcvrt.waveform_tables import TIME_NAMES, column, columns, voltage
 
 Array = NDArray[np.float64]
@@ -245,12 +245,14 @@ class Waveform:
         Raises
         ------
         InputError
-            a missing column (with the columns found), a cell that is not a number, unusable samples.
+            a missing column (with the columns found), a cell that is not a number, unusable samples, a gap in
+            a record that is sampled at a fixed interval.
         """
         table = columns(Path(path))
         where = f"{path}: waveform table"
         t = column(table, TIME_NAMES, where)
         v = voltage(table, phases, where)
+        raise_all(gaps(t), str(path))
         try:
             return cls.from_samples(t, v, jumps=jumps, name=Path(path).stem)
         except InputError as error:
@@ -291,7 +293,9 @@ class Waveform:
         raise_all(negative(found[magnitude], magnitude), str(path))
         turn = np.deg2rad(found[angle]) if angle else 0.0
         v = found[magnitude] / base * np.exp(1j * turn)
-        return cls.from_samples(np.asarray(record.time, dtype=float), v, jumps=jumps, name=Path(path).stem)
+        t = np.asarray(record.time, dtype=float)
+        raise_all(gaps(t), str(path))
+        return cls.from_samples(t, v, jumps=jumps, name=Path(path).stem)
 
     @classmethod
     def ercot_style(cls) -> Waveform:

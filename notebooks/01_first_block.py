@@ -97,6 +97,29 @@ told(lambda: hall(Misspelt()).compile())
 told(lambda: Forgetful(T=0.0))
 
 # %% [markdown]
+# Equations run on symbols too, and two things do not work on a symbol: asking whether it is large, and reading the
+# parameter from `self`, where it is a number that no later run could change.
+
+# %%
+class Choosing(Forgetful):
+    """Water that is only warmed."""
+
+    def equations(self, s):
+        warming = s.heat if s.heat > 0.0 else 0.0
+        return Equations(der=dict(theta=(warming - s.theta) / s.T), out=dict(rise=s.theta))
+
+
+class Frozen(Forgetful):
+    """Water whose time constant is what it was when the equations were written down."""
+
+    def equations(self, s):
+        return Equations(der=dict(theta=(s.heat - s.theta) / self.T), out=dict(rise=s.theta))
+
+
+told(lambda: hall(Choosing()).compile())
+told(lambda: hall(Frozen()).compile())
+
+# %% [markdown]
 # ## Getting it right
 #
 # The order is always the same: what it is in one sentence; the equation; what a reader must know to trust it;

@@ -211,6 +211,9 @@ def test_what_is_refused_and_how() -> None:
     assert error_of(lambda: scenarios.get("frequency-ramp", rocof=0.0)) == (
         "frequency-ramp: rocof = 0 must lie in [0.001, 100]."
     )
+    assert error_of(lambda: scenarios.get("frequency-ramp", rocof="1")) == (
+        "frequency-ramp: rocof = '1' is not a number."
+    )
 
 
 def test_names_are_listed_without_numpy() -> None:

@@ -189,6 +189,23 @@ def test_unusable_tables(tmp_path: Path, text: str, message: str) -> None:
     assert error_of(lambda: Waveform.from_csv(path)) == f"{path}: {message}"
 
 
+def test_a_record_with_a_gap_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+
+    def record(*times: float) -> Path:
+        path.write_text("t,v\n" + "".join(f"{t:.6g},1\n" for t in times), encoding="utf-8")
+        return path
+
+    before, after = (np.arange(30) * 0.01 + start for start in (0.0, 5.0))
+    assert error_of(lambda: Waveform.from_csv(record(*before, *after))) == (
+        f"{path}: no sample between 0.29 s and 5 s of a record with one every 0.01 s. "
+        "Fill the gap, or give the part before or after it."
+    )
+    assert len(Waveform.from_csv(record(*before, *(before + 0.39))).t) == 60  # ten steps without a sample
+    assert len(Waveform.from_csv(record(0.0, 0.1, 0.1, 0.25, 0.25, 5.0)).t) == 6  # points set by hand
+    assert len(Waveform.from_csv(record(*before, 0.3, 0.3, *(before + 0.31))).t) == 62  # a jump in a record
+
+
 def test_missing_file(tmp_path: Path) -> None:
     path = tmp_path / "none.csv"
     assert error_of(lambda: Waveform.from_csv(path)) == f"{path}: there is no such file."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dcvrt.facility.site import CONVERTER_RATING, site
+from dcvrt.facility.site import CONVERTER_RATING, give_names, site
 from dcvrt.models import (
     AcBus,
     AcLoad,
@@ -107,11 +107,11 @@ def standby_ups(f: Diagram, control: LineInteractiveControl | EcoModeControl) ->
 
 def name_outputs(f: Diagram, **others: Port) -> None:
     """Give the outputs that every variant has their names."""
-    outputs = {
-        "v_it": "supply.v_it", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i": "poi.drawn", "i_max": "bus.i_max",
+    usual = {
+        "v_it": "supply.v_it", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i_max": "bus.i_max",
         "p_b": "battery.p", "soc": "battery.soc", "w_dc": "supply.e",
         "p_load": "demand.demand", "p_out": "load.p", "p_it": "supply.p", "p_cool": "others.cooling",
         "mode": "control.mode", "stored": "ledger.stored", "p_loss": "ledger.loss",
+        "i": "poi.drawn",
     }  # fmt: skip
-    for output, path in outputs.items():
-        f.output(output, others[output] if output in others else f.port(path))
+    give_names(f, usual, others)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dcvrt.facility.site import site
+from dcvrt.facility.site import give_names, site
 from dcvrt.models import (
     ActivePriorityLimiter,
     Bess,
@@ -306,10 +306,9 @@ def _ups(
 def _name_outputs(f: Diagram, **others: Port) -> None:
     """The outputs that every variant has, some of them from other places than usual."""
     usual = {
-        "v_it": "bus.v", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i": "poi.drawn", "i_max": "lim.i_max",
+        "v_it": "bus.v", "p_g": "poi.p", "q_g": "poi.q", "i_g": "poi.i_mag", "i_max": "lim.i_max",
         "p_b": "bess.p", "soc": "bess.soc", "w_dc": "dc.w",
         "p_load": "load.demand", "p_out": "load.p", "p_it": "psu.p", "p_cool": "cooling.p",
-        "mode": "sup.mode", "stored": "ledger.stored", "p_loss": "ledger.loss",
+        "mode": "sup.mode", "stored": "ledger.stored", "p_loss": "ledger.loss", "i": "poi.drawn",
     }  # fmt: skip
-    for output, source in usual.items():
-        f.output(output, others.get(output) or f.port(source))
+    give_names(f, usual, others)

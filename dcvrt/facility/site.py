@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from dcvrt.models import AuxiliaryLoad, Cooling, Diagram, ItLoad, Phasor
+from dcvrt.models.block import Port
 
 CONVERTER_RATING = (1.15, "converter rating over H", "illustrative")
 
@@ -36,3 +39,9 @@ def site(name: str, doc: str, cooling: Cooling, rating: tuple[float, str, str] =
     f.bind(aux, H=H, d=d, share=(1 - 1 / pue) * (1 - k_cool))
     f.connect(g_it, it.g_it, cooling.g_it)
     return f
+
+
+def give_names(f: Diagram, usual: Mapping[str, str], others: Mapping[str, Port]) -> None:
+    """Name the outputs that every variant has: `usual` places, but for those that come from elsewhere."""
+    for output, path in usual.items():
+        f.output(output, others[output] if output in others else f.port(path))

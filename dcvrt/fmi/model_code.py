@@ -40,13 +40,14 @@ model_function model_rest;        /* (f, g) and its Jacobian by (x, z) */
 model_function model_start;       /* (u, p) -> first guess of (x, z) */
 model_function model_start_slope; /* (u, p, du, dp) -> the same along a direction */
 model_function model_held;        /* (p) -> dwell time of every row */
-model_function model_gaps;        /* (p) -> width and then the limits of every gap, one after the other */
+model_function model_together;    /* (p) -> what is tied to them, then width and limits of every gap */
 
 struct input {{ const char *name; double value; }};
 struct parameter {{ const char *name, *unit; double value, low, high; }};
 struct automaton {{ int start, n_flags; const double *flags; /* mode after mode */ }};
 struct row {{ int automaton, source, target; model_function *resets; const char *text; }};
 struct bound {{ const char *what, *where; }};
+struct tied {{ const char *what, *unit; double low, high; }};
 struct gap {{ const char *rows; int n_limits; const char *const *limits; }};
 
 extern const struct input model_inputs[];
@@ -54,7 +55,8 @@ extern const struct parameter model_parameters[];
 extern const struct automaton model_automata[];
 extern const struct row model_rows[];
 extern const struct bound model_bounds[];
-extern const struct gap model_gap_table[];
+extern const struct tied model_tied[];
+extern const struct gap model_gaps[];
 extern const bool model_reads_input[]; /* per event indicator */
 extern const double model_nominals[];
 extern const char *const model_states[];
@@ -78,8 +80,9 @@ def header(layout: Layout, at_rest: bool) -> str:
         "NA": len(dae.automata),
         "NROWS": len(layout.rows),
         "NBOUNDS": len(layout.bounds),
+        "NTIED": len(dae.tied),
         "NGAPS": len(layout.gaps),
-        "NGAP_VALUES": layout.gap_values.numel(),
+        "NTOGETHER": layout.together.numel(),
     }
     return HEADER.format(
         name=comment(dae.name),
@@ -140,7 +143,7 @@ def functions(layout: Layout) -> list[ca.Function]:
         dense("model_start", [dae.u, dae.p], [start]),
         dense("model_start_slope", [dae.u, dae.p, seeds[3], seeds[4]], [start_slope]),
         dense("model_held", [dae.p], [held]),
-        dense("model_gaps", [dae.p], [layout.gap_values]),
+        dense("model_together", [dae.p], [layout.together]),
     ]
     for k, (_, row) in enumerate(layout.rows):
         if row.reset:
@@ -187,6 +190,7 @@ def tables(layout: Layout) -> str:
     parameters = (
         entry(quoted(r.path), quoted(r.unit), *map(number, (r.value, *r.bounds))) for r in dae.parameter_rows
     )
+    tied = (entry(quoted(t.what), quoted(t.unit), *map(number, t.bounds)) for t in dae.tied)
     residuals = [f"d({r.path})/dt" for r in dae.states] + [f"residual of {r.path}" for r in dae.algebraics]
     algebraics = ", ".join(r.path for r in dae.algebraics)
     inputs = (entry(quoted(r.path), number(r.value)) for r in dae.inputs)
@@ -196,7 +200,8 @@ def tables(layout: Layout) -> str:
         table("struct automaton model_automata[]", automata),
         table("struct row model_rows[]", rows),
         table("struct bound model_bounds[]", bounds),
-        table("struct gap model_gap_table[]", gaps),
+        table("struct tied model_tied[]", tied),
+        table("struct gap model_gaps[]", gaps),
         table("bool model_reads_input[]", (str(flag).lower() for flag in layout.reads_input())),
         table("double model_nominals[]", map(number, nominals(dae))),
         table("char *const model_states[]", (quoted(r.path) for r in dae.states)),

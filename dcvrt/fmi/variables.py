@@ -62,7 +62,8 @@ class Layout:
     """Blocks of variables of one system, and the expressions behind them.
 
     `h` stacks what the event indicators are while their row is active: the guards of all rows, then
-    `sign (x - bound) - tolerance` of the bounds of states. `gap_values` stacks width and limits of every gap.
+    `sign (x - bound) - tolerance` of the bounds of states. `together` stacks what must be in order between
+    the parameters: what is tied to them, then width and limits of every gap.
     """
 
     def __init__(self, dae: Dae) -> None:
@@ -90,7 +91,7 @@ class Layout:
         widths_and_limits = [
             e for _, gap in self.gaps for e in (gap.width, *(limit for _, limit in gap.limits))
         ]
-        self.gap_values = ca.vertcat(ca.SX(0, 1), *widths_and_limits)
+        self.together = ca.vertcat(ca.SX(0, 1), *[tied.value for tied in dae.tied], *widths_and_limits)
         nx = len(dae.states)
         sizes = (1, nx, nx, len(dae.inputs), len(dae.parameter_rows), len(dae.outputs), len(dae.algebraics))
         starts = np.cumsum((0, *sizes, len(self.rows) + len(self.bounds)))

@@ -303,6 +303,8 @@ def read_units(path: Path, dynamics: Path | None, machines: Sequence[Machine], n
     add_machines(system, machines)
     with quiet():
         system.setup()
+    if not system.SynGen.n:
+        raise InputError(NO_MACHINES.format(where=name))
     lacking = units.unsupported(system)
     if lacking:
         lines = [
@@ -313,10 +315,7 @@ def read_units(path: Path, dynamics: Path | None, machines: Sequence[Machine], n
             + "\n  ".join(lines)
             + "\nWay out: engine='andes', or replace these devices."
         )
-    found = tuple(units.read_units(system))
-    if not found:
-        raise InputError(NO_MACHINES.format(where=name))
-    return found
+    return tuple(units.read_units(system))
 
 
 def add_machines(system: Any, units: Sequence[Machine]) -> None:

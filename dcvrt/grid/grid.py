@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.dae import Dae
 from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
 from dcvrt.grid.faults import BusFault, Fault, FaultSequence, LineTrip, branch
@@ -18,6 +19,7 @@ from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
 from dcvrt.models import Diagram
+from dcvrt.models.machines import UnitBlock
 from dcvrt.waveform import Waveform
 
 Floats = npt.NDArray[np.float64]
@@ -92,6 +94,9 @@ class Grid:
         to their limits, losses included; `slack`: the unit at the slack bus.
     reactive_limits : bool
         Whether the native engine's power flow keeps units within their reactive limits; ANDES's does not.
+    load_model, wind_model : block of `dcvrt.models.machines`, optional
+        What network loads and wind are in a fault, for the native engine: `ExponentialLoad`, `ZipLoad`,
+        `CurrentConverter`. Impedances when not given.
     """
 
     name: str
@@ -102,6 +107,8 @@ class Grid:
     rule: bool = False
     redispatch: str = "proportional"
     reactive_limits: bool = False
+    load_model: UnitBlock | None = None
+    wind_model: UnitBlock | None = None
 
     @classmethod
     def from_case(
@@ -112,6 +119,8 @@ class Grid:
         dynamics: str | Path | None = None,
         redispatch: str = "proportional",
         reactive_limits: bool = False,
+        load_model: UnitBlock | None = None,
+        wind_model: UnitBlock | None = None,
     ) -> Grid:
         """Open a case.
 
@@ -129,6 +138,8 @@ class Grid:
             `proportional` or `slack`.
         reactive_limits : bool
             Whether the native engine's power flow keeps units within their reactive limits.
+        load_model, wind_model : block of `dcvrt.models.machines`, optional
+            What network loads and wind are in a fault, for the native engine; impedances when not given.
 
         Raises
         ------
@@ -138,7 +149,7 @@ class Grid:
         if str(case) == "ieee118":
             if dynamics is not None:
                 raise InputError("ieee118 has its own dynamic data; dynamics= is for case files.")
-            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch, reactive_limits)
+            grid = cls("ieee118", andes.case118(), tuple(sites), pf, None, True, redispatch)
         else:
             path = Path(case)
             if not path.suffix:
@@ -148,7 +159,8 @@ class Grid:
             if dynamics is None and path.suffix.lower() == ".raw" and beside.is_file():
                 dynamics = beside
             given = Path(dynamics) if dynamics else None
-            grid = cls(path.stem, path, tuple(sites), pf, given, False, redispatch, reactive_limits)
+            grid = cls(path.stem, path, tuple(sites), pf, given, False, redispatch)
+        grid = replace(grid, reactive_limits=reactive_limits, load_model=load_model, wind_model=wind_model)
         grid._check()
         return grid
 
@@ -171,7 +183,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> dict[int, Waveform]:
         """POI voltage at every site under one fault.
 
@@ -193,11 +205,11 @@ class Grid:
             Quantities that the waveforms carry tangents of, with `native`: `H` (every site) or `H_<bus>`, MW;
             `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
             cleared, s.
-        facilities : mapping of site to Diagram, optional
+        facilities : mapping of site to Diagram or Dae, optional
             Facilities that act back on the network, with `native`; what is hosted at other sites is a
             constant
             impedance in the fault. Each has the site's capacity, the period's load factor and the grid's
-            power factor; its own `beta`.
+            power factor; its own `beta`. A Dae, once compiled, is prepared once; a Diagram in every call.
 
         Returns
         -------
@@ -227,7 +239,7 @@ class Grid:
         engine: str = "native",
         step: float = STEP,
         wrt: Sequence[str] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> dict[Fault, FaultRun]:
         """Several faults of one operating point, which is solved and initialised once; see `waveforms`.
 
@@ -259,7 +271,7 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         bolted = [fault for fault in faults if isinstance(fault, BusFault)]
         point = self.operating_point(hosting, period, bolted)
@@ -276,7 +288,7 @@ class Grid:
         until: float,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
         by = thetas(wrt, self.sites, self.network)
         point = self.native.point(hosting, period, by, facilities)
@@ -306,6 +318,8 @@ class Grid:
             1 + 1j * float(np.tan(np.arccos(self.pf))),
             self.redispatch,
             self.reactive_limits,
+            self.load_model,
+            self.wind_model,
         )
 
     @property
@@ -361,7 +375,7 @@ class Grid:
         engine: str,
         step: float,
         wrt: Sequence[str],
-        facilities: Mapping[int, Diagram] | None,
+        facilities: Mapping[int, Diagram | Dae] | None,
     ) -> None:
         problems = []
         if engine not in ENGINES:
@@ -369,6 +383,11 @@ class Grid:
         if engine == "andes":
             if wrt:
                 problems.append("wrt: ANDES gives no derivatives. Way out: engine='native'.")
+            if self.load_model or self.wind_model:
+                problems.append(
+                    "load_model, wind_model: engine='andes' has loads and wind as impedances. Way out: "
+                    "engine='native'."
+                )
             if self.reactive_limits:
                 problems.append(
                     "reactive_limits: the power flow of engine='andes' does not keep them. Way out: "

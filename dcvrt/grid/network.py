@@ -235,31 +235,75 @@ class Network:
         at = np.r_[each, each], np.r_[self.from_index, self.to_index]
         return sp.csr_matrix((values, at), shape=(m, len(self.bus)))
 
+    @cached_property
+    def _reduced_laplacian(self) -> tuple[Integers, Any]:
+        """Buses but the slack, and the LU factors of the DC nodal matrix over them (it is symmetric)."""
+        keep = np.delete(np.arange(len(self.bus)), self.slack)
+        incidence = self.incidence[:, keep]
+        return keep, spla.splu((incidence.T @ sp.diags(self.susceptance) @ incidence).tocsc())
+
+    def _angles(self, injection: Floats) -> Floats:
+        """DC bus angles in rad, 0 at the slack, which takes what the injections do not balance."""
+        keep, factors = self._reduced_laplacian
+        angles = np.zeros(injection.shape)
+        angles[keep] = factors.solve(np.ascontiguousarray(injection[keep]))
+        return angles
+
     def ptdf(self) -> Floats:
         """Power transfer distribution factors: DC branch flow per MW injected at a bus, taken at the slack.
 
         Returns
         -------
         array (branches, buses)
-            The column of the slack bus is zero. See `flows` for the constant part that phase shifters add.
+            Dense, and so meant for small networks: `transfer` and `adjoint` give what is needed of it by
+            sparse solves. The column of the slack bus is zero. See `flows` for the constant part that phase
+            shifters add.
         """
         return self._ptdf
 
     @cached_property
     def _ptdf(self) -> Floats:
-        keep = np.delete(np.arange(len(self.bus)), self.slack)
-        flow_of_angle = (sp.diags(self.susceptance) @ self.incidence).tocsc()[:, keep]
-        laplacian = (self.incidence[:, keep].T @ flow_of_angle).tocsc()
-        factors = np.zeros((len(self.branches), len(self.bus)))
-        factors[:, keep] = spla.splu(laplacian).solve(flow_of_angle.T.toarray()).T  # Laplacian is symmetric
+        factors = np.ascontiguousarray(self.transfer(np.eye(len(self.bus))))
         factors.flags.writeable = False
         return factors
+
+    def transfer(self, injection: Floats) -> Floats:
+        """DC branch flows in MW that injections drive, without those of phase shifters: PTDF @ injection.
+
+        Parameters
+        ----------
+        injection : array (buses,) or (buses, count)
+            MW; what they do not balance is taken at the slack bus.
+
+        Returns
+        -------
+        array (branches,) or (branches, count)
+        """
+        return self._flow_of_angle @ self._angles(injection)
+
+    @cached_property
+    def _flow_of_angle(self) -> sp.csr_matrix:
+        return (sp.diags(self.susceptance) @ self.incidence).tocsr()
+
+    def adjoint(self, weights: Floats) -> Floats:
+        r"""Weighted sum of rows of the transfer factors, :math:`\mathrm{PTDF}^T w`, by one sparse solve.
+
+        Parameters
+        ----------
+        weights : array (branches,) or (branches, count)
+
+        Returns
+        -------
+        array (buses,) or (buses, count)
+            Change of the weighted flow per MW injected at each bus.
+        """
+        return self._angles(self._flow_of_angle.T @ weights)
 
     @cached_property
     def shift_flow(self) -> Floats:
         """Flow that the phase shifters drive with no injection at all, MW per branch."""
         own = -self.susceptance * self.branches.shift
-        return own - self.ptdf() @ (self.incidence.T @ own)
+        return own - self.transfer(self.incidence.T @ own)
 
     def flows(self, injection: Floats) -> Floats:
         """DC branch flows in MW for bus injections in MW: (buses,) or (buses, hours).
@@ -267,7 +311,7 @@ class Network:
         What the injections do not balance is taken at the slack bus.
         """
         offset = self.shift_flow if injection.ndim == 1 else self.shift_flow[:, None]
-        return self.ptdf() @ injection + offset
+        return self.transfer(injection) + offset
 
     # -- where networks come from --------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import redispatch
-from dcvrt.grid.andes import Said, quiet
+from dcvrt.grid.andes import NO_MACHINES, Said, quiet
 from dcvrt.grid.faults import BusFault
 from dcvrt.grid.trapezoid import NoConvergenceError, Stepper
 
@@ -81,11 +81,7 @@ class OperatingPoint:
         with quiet() as said:
             system.setup()
             if not system.SynGen.n:
-                raise InputError(
-                    f"{where}: the case has no dynamic data, not one machine. Way out: add a machine "
-                    "(GENROU, GENCLS) for each generator, in a .dyr file given as dynamics=... or in the "
-                    "case itself."
-                )
+                raise InputError(NO_MACHINES.format(where=where))
             reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
             system.PQ.p0.v[:loads] *= load_scale
             system.PQ.q0.v[:loads] *= load_scale

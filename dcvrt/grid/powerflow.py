@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,22 @@ from dcvrt.grid.network import Network
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Phasors = npt.NDArray[np.complex128]
+Limited = npt.NDArray[np.int8]
+"""Of each `pv` bus: 1 at its largest, -1 at its smallest reactive output, 0 where it holds its voltage."""
 
 TOLERANCE = 1e-9
 """Largest power mismatch of a solution, pu on the system base."""
+LIMIT_TOLERANCE = 1e-8
+"""Excess over a reactive limit, and difference to a set point, that switches no bus, pu."""
+CLOSE = 1e-4
+"""Mismatch below which hours of a batch are looked at for buses that switch, pu."""
+LOOKS = 40
+"""Switches of an hour before it counts as unsolved; after half of them no bus is released any more."""
+LEVEL = 0.02
+"""Hours whose load lies within so much of the reference load share one Jacobian."""
+MOST_LEVELS = 60
+DENSE = 1000
+"""Buses up to which the Jacobian is a dense matrix."""
 
 
 def participation(network: Network) -> Floats:
@@ -99,11 +113,14 @@ class OperatingPoint:
     iterations : int
     mismatch_mva : float
         Largest power mismatch left.
+    limited : int array (pv buses,)
+        Reactive limit that each bus of `PowerFlow.pv` is at; empty without reactive limits.
     """
 
     v: Phasors
     iterations: int
     mismatch_mva: float
+    limited: Limited = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +138,8 @@ class HourlySolution:
         Number of the bus where it is.
     hours : int array (hours,)
         Names of the hours.
+    limited : int array (pv buses, hours)
+        Reactive limit that each bus of `PowerFlow.pv` is at; no rows without reactive limits.
     """
 
     v: Phasors
@@ -128,6 +147,7 @@ class HourlySolution:
     mismatch_mva: Floats
     worst_bus: Integers
     hours: Integers
+    limited: Limited
 
     @property
     def status(self) -> str:
@@ -142,6 +162,17 @@ class HourlySolution:
             "Way out: host less there, or check the load and the voltage set points of that hour."
         )
 
+    def take(self, at: Integers) -> HourlySolution:
+        """The hours at some places."""
+        return HourlySolution(
+            self.v[:, at],
+            self.converged[at],
+            self.mismatch_mva[at],
+            self.worst_bus[at],
+            self.hours[at],
+            self.limited[:, at],
+        )
+
     def require(self) -> HourlySolution:
         """Return itself, or raise `SimulationError` with `status` when an hour has no solution."""
         if not self.converged.all():
@@ -149,28 +180,132 @@ class HourlySolution:
         return self
 
 
+class _Steering:
+    """Approximate Newton steps of many hours from one Jacobian: it only steers, residuals are exact.
+
+    With unit limits enforced the Jacobian is kept in blocks, so that every hour can have its own buses that
+    hold Q instead of their voltage: of the rows and columns of those the Schur complement is inverted, once
+    for each set of buses that occurs.
+
+    Parameters
+    ----------
+    jacobian : matrix
+        By angles of `free`, sizes of `pq`, then sizes of `pv` buses; rows P of `free`, Q of `pq`, Q of `pv`.
+    basic : int
+        Rows and columns without the `pv` part.
+    """
+
+    def __init__(self, jacobian: Any, basic: int) -> None:
+        self.dense = isinstance(jacobian, np.ndarray)
+        self._factors: Any = None
+        inner = jacobian[:basic, :basic]
+        if self.dense:
+            inverse = np.linalg.inv(inner)
+            self._inverse = inverse.astype(np.float32)
+        else:
+            self._factors = spla.splu(sp.csc_matrix(inner))
+        self._column, self._row, self._schur = np.zeros((basic, 0)), np.zeros((0, basic)), np.zeros((0, 0))
+        if jacobian.shape[0] > basic:
+            outer, below, corner = (
+                jacobian[:basic, basic:],
+                jacobian[basic:, :basic],
+                jacobian[basic:, basic:],
+            )
+            if self.dense:
+                self._column, self._row = inverse @ outer, below @ inverse
+            else:
+                outer, below, corner = (np.asarray(m.toarray(), float) for m in (outer, below, corner))
+                self._column = np.asarray(self._factors.solve(outer), dtype=np.float64)
+                self._row = np.asarray(self._factors.solve(below.T.copy(), "T").T, dtype=np.float64)
+            self._schur = corner - below @ self._column
+        self._inverted: dict[bytes, Floats] = {}
+
+    def step(self, rest: Floats, at_limit: Limited) -> Floats:
+        """Step for residuals (rows, hours): angles, sizes at `pq`, sizes at `pv` buses (0 where held)."""
+        n = self._column.shape[0]
+        inner = self._solve(rest[:n])
+        if not at_limit.any():
+            return np.vstack([inner, np.zeros((len(self._schur), rest.shape[1]))])
+        short = rest[n:] - self._row @ rest[:n]
+        size = np.zeros_like(short)
+        for buses, hours in _same_sets(at_limit != 0):
+            key = buses.tobytes()
+            if key not in self._inverted:
+                block = np.linalg.inv(self._schur[np.ix_(buses, buses)])
+                self._inverted[key] = np.asarray(block, dtype=np.float64)
+            size[np.ix_(buses, hours)] = self._inverted[key] @ short[np.ix_(buses, hours)]
+        return np.vstack([inner - self._column @ size, size])
+
+    def _solve(self, rest: Floats) -> Floats:
+        if not self.dense:
+            return np.asarray(self._factors.solve(np.ascontiguousarray(rest)))
+        size = max(float(abs(rest).max(initial=0.0)), 1e-300)  # scaled: single precision underflows
+        return np.asarray(size * (self._inverse @ (rest / size).astype(np.float32)), dtype=np.float64)
+
+
+def _same_sets(chosen: npt.NDArray[np.bool_]) -> list[tuple[Integers, Integers]]:
+    """Sets of rows that occur in columns, each with its columns; columns without any are left out."""
+    packed = np.ascontiguousarray(np.packbits(chosen, axis=0).T)
+    code = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
+    order = np.argsort(code, kind="stable")
+    _, begin = np.unique(code[order], return_index=True)
+    groups = np.split(order, begin[1:])
+    sets = [(np.flatnonzero(chosen[:, hours[0]]), hours) for hours in groups]
+    return [(buses, hours) for buses, hours in sets if len(buses)]
+
+
 class PowerFlow:
     r"""Power flow equations of a network, in polar voltages.
 
     .. math:: S_k = V_k \Big(\sum_m Y_{km} V_m\Big)^*
 
-    with P given at all buses but the slack and Q at `pq` buses. `pv` and `slack` buses hold `v_set` without
-    reactive limits. Many hours are solved together by chord Newton: hours are sorted by net load into a few
-    groups, each with one Jacobian, inverted once; residuals are exact, so only the number of steps suffers.
+    with P given at all buses but the slack and Q at `pq` buses. `pv` and `slack` buses hold `v_set`. With
+    `reactive_limits` a `pv` bus does so only as far as its units can:
+
+    .. math::
+        \underline Q \le Q \le \overline Q, \qquad
+        V = V^{set} \;\text{or}\; (Q = \overline Q,\, V \le V^{set}) \;\text{or}\;
+        (Q = \underline Q,\, V \ge V^{set})
+
+    and the bus is `pq` where it cannot (PV-PQ switching, both ways). The slack bus has no limits.
+
+    Many hours are solved together by chord Newton: hours of similar load share one Jacobian, kept for the
+    next call; residuals are exact, so only the number of steps suffers.
+
+    Parameters
+    ----------
+    network : Network
+    reactive_limits : bool
+        Whether the reactive limits of the units are enforced; units at one bus are taken together.
     """
 
-    def __init__(self, network: Network) -> None:
-        self.network = network
+    def __init__(self, network: Network, reactive_limits: bool = False) -> None:
+        self.network, self.reactive_limits = network, reactive_limits
         kind = np.array(network.kind)
         self.pq = np.flatnonzero(kind == "pq")
+        self.pv = np.flatnonzero(kind == "pv") if reactive_limits else np.zeros(0, dtype=np.int64)
+        """Buses that may switch; none without `reactive_limits`."""
         self.free = np.r_[np.flatnonzero(kind == "pv"), self.pq]
         """Buses whose angle is unknown: `pv`, then `pq`."""
+        self.moving = np.r_[self.pq, self.pv]
+        """Buses whose voltage can move."""
         self._y = network.admittance()
+        at = network.generator_index
+        bus = len(network.bus)
+        units = network.generators
+        self.q_low, self.q_high = (
+            np.bincount(at, q, bus)[self.pv] / network.base_mva for q in (units.q_min, units.q_max)
+        )
+        self._steerings: dict[int, _Steering] = {}
 
     @cached_property
     def flat(self) -> Phasors:
         """Start values: set points where a voltage is held, 1 pu elsewhere, angle 0."""
         return self.network.v_set.astype(complex)
+
+    @cached_property
+    def _dense_y(self) -> Phasors:
+        return np.asarray(self._y.toarray())
 
     # -- one point -----------------------------------------------------------------------------------------
 
@@ -180,7 +315,7 @@ class PowerFlow:
         Parameters
         ----------
         injection : complex array (buses,)
-            Scheduled injections, MVA.
+            Scheduled injections, MVA; at `pv` buses their imaginary part is the demand alone.
         start : complex array (buses,), optional
 
         Raises
@@ -188,8 +323,8 @@ class PowerFlow:
         SimulationError
             When Newton does not settle, with the bus of the largest mismatch.
         """
-        found = self._newton(injection / self.network.base_mva, self.flat if start is None else start, steps)
-        v, iterations, worst = found
+        s = injection / self.network.base_mva
+        v, iterations, worst, limited = self._switched(s, self.flat if start is None else start, steps)
         if not abs(worst).max() < TOLERANCE:
             bus = self.network.bus[self._bus_of_row(abs(worst).argmax())]
             raise SimulationError(
@@ -197,58 +332,134 @@ class PowerFlow:
                 f"{abs(worst).max() * self.network.base_mva:.3g} MVA, largest at bus {bus}. "
                 "Way out: host less there, or check loads and voltage set points."
             )
-        return OperatingPoint(v, iterations, float(abs(worst).max() * self.network.base_mva))
+        return OperatingPoint(v, iterations, float(abs(worst).max() * self.network.base_mva), limited)
 
     def _bus_of_row(self, row: npt.ArrayLike) -> Integers:
-        return np.r_[self.free, self.pq][row]
+        return np.r_[self.free, self.moving][row]
 
-    def _mismatch(self, v: Phasors, current: Phasors, s: Phasors) -> Floats:
+    def _mismatch(self, v: Phasors, current: Phasors, s: Phasors, limited: Limited) -> Floats:
+        """Missed equations: P of `free`, Q of `pq`, and Q of `pv` buses at a limit (0 where V is held)."""
         power = v * current.conj() - s
-        return np.concatenate([power[self.free].real, power[self.pq].imag])
+        rows = [power[self.free].real, power[self.pq].imag]
+        if len(self.pv):
+            rows.append(np.where(limited == 0, 0.0, power[self.pv].imag - self._limit(limited)))
+        return np.concatenate(rows)
 
-    def _jacobian(self, v: Phasors) -> sp.csc_matrix:
-        """Derivative of the mismatch by the angles of `free` and the magnitudes of `pq`."""
+    def _limit(self, limited: Limited) -> Floats:
+        shape = (-1,) + (1,) * (limited.ndim - 1)
+        return np.where(limited > 0, self.q_high.reshape(shape), self.q_low.reshape(shape))
+
+    def _switch(
+        self, v: Phasors, current: Phasors, s: Phasors, limited: Limited, back: Any = True
+    ) -> Limited:
+        """Which limit each `pv` bus is at after one look at a solution; with `back` buses are released."""
+        if not len(self.pv):
+            return limited
+        q = (v[self.pv] * current[self.pv].conj() - s[self.pv]).imag
+        shape = (-1,) + (1,) * (q.ndim - 1)
+        size, held = abs(v[self.pv]), self.network.v_set[self.pv].reshape(shape)
+        beyond = (q > self.q_high.reshape(shape) + LIMIT_TOLERANCE).astype(np.int8)
+        beyond -= q < self.q_low.reshape(shape) - LIMIT_TOLERANCE
+        wrong = ((limited > 0) & (size > held + LIMIT_TOLERANCE)) | (
+            (limited < 0) & (size < held - LIMIT_TOLERANCE)
+        )
+        kept = np.where(wrong & back, 0, limited)
+        return np.where(limited == 0, beyond, kept).astype(np.int8)
+
+    def _jacobian(self, v: Phasors, sizes: Integers) -> Any:
+        """Derivative of P of `free` and Q of `sizes` by the angles of `free` and the voltages of `sizes`."""
         current = self._y @ v
-        unit = sp.diags(v / abs(v))
-        by_angle = (1j * sp.diags(v) @ (sp.diags(current) - self._y @ sp.diags(v)).conj()).tocsr()
-        by_size = (sp.diags(v) @ (self._y @ unit).conj() + sp.diags(current.conj()) @ unit).tocsr()
-        a, q = self.free, self.pq
+        a = self.free
+        if len(v) <= DENSE:
+            y = self._dense_y
+            unit = v / abs(v)
+            by_angle = 1j * v[:, None] * (np.diag(current) - y * v).conj()
+            by_size = v[:, None] * (y * unit).conj() + np.diag(current.conj() * unit)
+            return np.block(
+                [
+                    [by_angle[np.ix_(a, a)].real, by_size[np.ix_(a, sizes)].real],
+                    [by_angle[np.ix_(sizes, a)].imag, by_size[np.ix_(sizes, sizes)].imag],
+                ]
+            )
+        phase = sp.diags(v / abs(v))
+        angle = sp.csr_matrix(1j * sp.diags(v) @ (sp.diags(current) - self._y @ sp.diags(v)).conj())
+        size = sp.csr_matrix(sp.diags(v) @ (self._y @ phase).conj() + sp.diags(current.conj()) @ phase)
         return sp.bmat(
-            [[by_angle[a][:, a].real, by_size[a][:, q].real], [by_angle[q][:, a].imag, by_size[q][:, q].imag]]
+            [
+                [angle[a][:, a].real, size[a][:, sizes].real],
+                [angle[sizes][:, a].imag, size[sizes][:, sizes].imag],
+            ]
         ).tocsc()
 
-    def _newton(self, s: Phasors, start: Phasors, steps: int) -> tuple[Phasors, int, Floats]:
+    def _switched(self, s: Phasors, start: Phasors, steps: int) -> tuple[Phasors, int, Floats, Limited]:
+        """Newton, and again with the buses that switch, until none does."""
+        limited = np.zeros(len(self.pv), dtype=np.int8)
+        v, total = start, 0
+        for look in range(LOOKS):
+            v, count, rest = self._newton(s, v, steps, limited)
+            total += count
+            if not abs(rest).max() < TOLERANCE:
+                break
+            current = np.asarray(self._y @ v, dtype=np.complex128)
+            now = self._switch(v, current, s, limited, back=look < LOOKS // 2)
+            if (now == limited).all():
+                break
+            v = v.copy()
+            released = self.pv[(now == 0) & (limited != 0)]
+            v[released] *= self.network.v_set[released] / abs(v[released])
+            limited = now
+        else:
+            rest = np.full(len(rest), np.inf)
+        return v, total, rest, limited
+
+    def _newton(
+        self, s: Phasors, start: Phasors, steps: int, limited: Limited
+    ) -> tuple[Phasors, int, Floats]:
         angle, size = np.angle(start), abs(start)
         n = len(self.free)
+        unheld = self.pv[limited != 0]
+        sizes = np.r_[self.pq, unheld]
+        rows = np.r_[np.ones(n + len(self.pq), dtype=bool), limited != 0]
         with np.errstate(all="ignore"):
             for step in range(steps + 1):
                 v = size * np.exp(1j * angle)
-                rest = self._mismatch(v, self._y @ v, s)
+                rest = self._mismatch(v, self._y @ v, s, limited)
                 if not np.isfinite(rest).all() or abs(rest).max() < TOLERANCE or step == steps:
                     break
+                jacobian = self._jacobian(v, sizes)
                 try:
-                    move = spla.splu(self._jacobian(v)).solve(rest)
-                except RuntimeError:  # singular Jacobian: the nose of the curve
+                    if isinstance(jacobian, np.ndarray):
+                        move = np.linalg.solve(jacobian, rest[rows])
+                    else:
+                        move = spla.splu(jacobian).solve(rest[rows])
+                except (RuntimeError, np.linalg.LinAlgError):  # singular Jacobian: the nose of the curve
                     break
                 angle[self.free] -= move[:n]
-                size[self.pq] -= move[n:]
+                size[sizes] -= move[n:]
         return v, step, np.where(np.isfinite(rest), rest, np.inf)
 
     # -- many hours ----------------------------------------------------------------------------------------
 
     def solve_hours(
-        self, injection: Phasors, start: Phasors | None = None, hours: Integers | None = None, steps: int = 40
+        self,
+        injection: Phasors,
+        start: Phasors | None = None,
+        hours: Integers | None = None,
+        steps: int = 60,
+        limited: Limited | None = None,
     ) -> HourlySolution:
         """Solve many operating points at once.
 
         Parameters
         ----------
         injection : complex array (buses, hours)
-            Scheduled injections, MVA.
+            Scheduled injections, MVA; at `pv` buses their imaginary part is the demand alone.
         start : complex array (buses, hours), optional
             Start values, for instance the solution at a nearby hosting vector.
         hours : int array (hours,), optional
             Names of the hours for messages; default 0, 1, ...
+        limited : int array (pv buses, hours), optional
+            Limits that buses are at in `start`; default none.
 
         Returns
         -------
@@ -258,54 +469,87 @@ class PowerFlow:
         v = np.empty(s.shape, dtype=complex)
         rest = np.full(s.shape[1], np.inf)
         row = np.zeros(s.shape[1], dtype=np.int64)
-        warm = None
-        for group in self._groups(s):
+        at = np.zeros((len(self.pv), s.shape[1]), dtype=np.int8)
+        for level, group in self._levels(s):
             if start is None:
-                centre, _, left = self._newton(
-                    s[:, group].mean(axis=1), self.flat if warm is None else warm, 30
-                )
+                centre, _, left = self._newton(s[:, group].mean(axis=1), self.flat, 30, at[:, 0] * 0)
                 if not abs(left).max() < TOLERANCE:
                     centre = self.flat  # the hours are tried one by one below
-                warm = centre
                 begin = np.repeat(centre[:, None], len(group), axis=1)
             else:
                 begin = start[:, group]
-                centre = begin.mean(axis=1)
-            v[:, group], rest[group], row[group] = self._chord(
-                s[:, group], begin, self._inverse(centre), steps
+            first = at[:, group] if limited is None else limited[:, group]
+            v[:, group], rest[group], row[group], at[:, group] = self._chord(
+                s[:, group], begin, self._steering(level, begin.mean(axis=1)), steps, first
             )
         for k in np.flatnonzero(~(rest < TOLERANCE)):
-            v[:, k], _, left = self._newton(s[:, k], self.flat, 30)
+            v[:, k], _, left, at[:, k] = self._switched(s[:, k], self.flat, 30)
             row[k] = abs(left).argmax()
             rest[k] = abs(left).max()
         names = np.arange(s.shape[1]) if hours is None else hours
         return HourlySolution(
-            v, rest < TOLERANCE, rest * self.network.base_mva, self.network.bus[self._bus_of_row(row)], names
+            v,
+            rest < TOLERANCE,
+            rest * self.network.base_mva,
+            self.network.bus[self._bus_of_row(row)],
+            names,
+            at,
         )
 
-    def _groups(self, s: Phasors) -> list[Integers]:
-        """Hours sorted by load at `pq` buses and cut into groups of similar size."""
-        order = np.argsort(s[self.pq].real.sum(axis=0), kind="stable")
-        return [g for g in np.array_split(order, min(8, max(1, len(order) // 64))) if len(g)]
+    def _levels(self, s: Phasors) -> list[tuple[int, Integers]]:
+        """Hours by the level of their load at `pq` buses, in steps of a share of the reference load."""
+        step = LEVEL * max(abs(self.network.p_load.sum()) / self.network.base_mva, 1e-9)
+        level = np.rint(s[self.pq].real.sum(axis=0) / step).astype(np.int64)
+        if not len(level):
+            return []
+        order = np.argsort(level, kind="stable")
+        found, begin = np.unique(level[order], return_index=True)
+        return list(zip(found.tolist(), np.split(order, begin[1:]), strict=True))
 
-    def _inverse(self, v: Phasors) -> npt.NDArray[np.float32]:
-        """Inverse Jacobian at one point, in single precision: it only steers, the residuals are exact."""
-        return np.linalg.inv(self._jacobian(v).toarray()).astype(np.float32)
+    def _steering(self, level: int, v: Phasors) -> _Steering:
+        """The steering of a load level, made at `v` when it is first needed."""
+        if level not in self._steerings:
+            if len(self._steerings) > MOST_LEVELS:
+                self._steerings.clear()
+            self._steerings[level] = _Steering(self._jacobian(v, self.moving), len(self.free) + len(self.pq))
+        return self._steerings[level]
 
     def _chord(
-        self, s: Phasors, start: Phasors, inverse: npt.NDArray[np.float32], steps: int
-    ) -> tuple[Phasors, Floats, Integers]:
-        """Newton with one inverse for all columns; columns that are done leave the loop."""
+        self, s: Phasors, start: Phasors, steering: _Steering, steps: int, limited: Limited
+    ) -> tuple[Phasors, Floats, Integers, Limited]:
+        """Newton with one Jacobian for all columns; columns that are done leave the loop."""
         n, count = len(self.free), s.shape[1]
-        v = start.copy()
+        v, at = start.copy(), limited.copy()
         worst, row = np.full(count, np.inf), np.zeros(count, dtype=np.int64)
-        todo = np.arange(count)
+        todo, held = np.arange(count), self.network.v_set[self.pv]
         size, angle = abs(start), np.angle(start)
+        looks = np.zeros(count, dtype=np.int64)
         with np.errstate(all="ignore"):
             for _ in range(steps):
                 now = size * np.exp(1j * angle)
-                rest = self._mismatch(now, self._y @ now, s[:, todo])
+                current = self._y @ now
+                rest = self._mismatch(now, current, s[:, todo], at[:, todo])
                 level = abs(rest).max(axis=0)
+                if len(self.pv) and (level < CLOSE).any():
+                    settled = np.flatnonzero(level < CLOSE)
+                    hours = todo[settled]
+                    back = looks[hours] < LOOKS // 2
+                    fresh = self._switch(
+                        now[:, settled], current[:, settled], s[:, hours], at[:, hours], back
+                    )
+                    changed = (fresh != at[:, hours]).any(axis=0) & (looks[hours] < LOOKS)
+                    looks[hours[changed]] += 1
+                    if changed.any():
+                        at[:, hours[changed]] = fresh[:, changed]
+                        released = fresh == 0
+                        sizes = size[np.ix_(self.pv, settled)]
+                        size[np.ix_(self.pv, settled)] = np.where(released, held[:, None], sizes)
+                        level[settled[changed]] = 1.0
+                        now[:, settled] = size[:, settled] * np.exp(1j * angle[:, settled])
+                        current = self._y @ now
+                        rest = self._mismatch(now, current, s[:, todo], at[:, todo])
+                    unsettled = (fresh != at[:, hours]).any(axis=0)
+                    level[settled[unsettled]] = np.inf
                 v[:, todo], worst[todo] = now, np.where(np.isfinite(level), level, np.inf)
                 row[todo] = abs(rest).argmax(axis=0)
                 going = (level >= TOLERANCE) & (level < 1e3)
@@ -313,16 +557,18 @@ class PowerFlow:
                     break
                 if going.mean() < 0.7:
                     todo, size, angle, rest = todo[going], size[:, going], angle[:, going], rest[:, going]
-                move = inverse @ rest.astype(np.float32)
+                move = steering.step(rest, at[:, todo])
                 angle[self.free] -= move[:n]
-                size[self.pq] -= move[n:]
-        return v, worst, row
+                size[self.moving] -= move[n:]
+        return v, worst, row, at
 
-    def sensitivities(self, v: Phasors, directions: Phasors, scale: Floats) -> Floats:
-        r"""Derivative of the voltage magnitude at every `pq` bus by each hosted MW, exactly at `v`.
+    def sensitivities(
+        self, v: Phasors, directions: Phasors, scale: Floats, limited: Limited | None = None
+    ) -> Floats:
+        r"""Derivative of the voltage magnitude at every `moving` bus by each hosted MW, exactly at `v`.
 
         Solves :math:`J_t\, x = d_t\, r_j` in every hour t for every direction r_j, by chord iteration with
-        exact residuals, to a relative residual of 1e-10.
+        exact residuals, to a relative residual of 1e-8. A bus at a reactive limit keeps its Q.
 
         Parameters
         ----------
@@ -332,34 +578,40 @@ class PowerFlow:
             Change of the scheduled injections, MVA per unit of each parameter.
         scale : array (hours,)
             Factor on every direction in each hour (d_t).
+        limited : int array (pv buses, hours), optional
+            Limits that `pv` buses are at, as `HourlySolution.limited` has them; default none.
 
         Returns
         -------
-        array (pq buses, hours, count)
-            pu per unit of the parameter; zero at the other buses, which hold their voltage.
+        array (moving buses, hours, count)
+            pu per unit of the parameter; zero at buses that hold their voltage. Without `reactive_limits` the
+            moving buses are the `pq` buses.
         """
-        n, m = len(self.free), len(self.pq)
-        result = np.empty((m, v.shape[1], len(directions)))
+        n = len(self.free)
+        at = np.zeros((len(self.pv), v.shape[1]), dtype=np.int8) if limited is None else limited
+        result = np.empty((len(self.moving), v.shape[1], len(directions)))
         unit, current = v / abs(v), self._y @ v
-        for group in self._groups(v * current.conj()):
-            inverse = self._inverse(v[:, group].mean(axis=1))
-            vg, ug, ig = v[:, group], unit[:, group], current[:, group].conj()
+        for level, group in self._levels(v * current.conj()):
+            steering = self._steering(level, v[:, group].mean(axis=1))
+            vg, ug, ig, ag = v[:, group], unit[:, group], current[:, group].conj(), at[:, group]
             for j, direction in enumerate(directions / self.network.base_mva):
-                base = np.r_[direction[self.free].real, direction[self.pq].imag]
+                base = np.r_[direction[self.free].real, direction[self.pq].imag, direction[self.pv].imag]
                 right = np.outer(base, scale[group])
+                right[n + len(self.pq) :][ag == 0] = 0.0
                 size = abs(right).max()
-                x = np.outer(inverse @ base, scale[group])
+                x = steering.step(right, ag)
                 for _ in range(60):
                     dv = np.zeros_like(vg)
                     dv[self.free] = 1j * vg[self.free] * x[:n]
-                    dv[self.pq] += ug[self.pq] * x[n:]
+                    dv[self.moving] += ug[self.moving] * x[n:]
                     power = dv * ig + vg * (self._y @ dv).conj()
-                    rest = np.concatenate([power[self.free].real, power[self.pq].imag]) - right
-                    if abs(rest).max() <= 1e-10 * size:
+                    rows = [power[self.free].real, power[self.pq].imag]
+                    if len(self.pv):
+                        rows.append(np.where(ag == 0, 0.0, power[self.pv].imag))
+                    rest = np.concatenate(rows) - right
+                    if abs(rest).max() <= 1e-8 * size:
                         break
-                    x -= size * (
-                        inverse @ (rest / size).astype(np.float32)
-                    )  # scaled: single precision underflows
+                    x -= steering.step(rest, ag)
                 else:
                     raise SimulationError(
                         f"{self.network.name}: voltage sensitivities did not settle; the operating "

@@ -172,6 +172,9 @@ IDLE = {
     "BusFreq": "measures; a stabiliser that reads it has it inside its unit",
     "BusROCOF": "measures",
     "PMU": "measures",
+    "PLL1": "measures; a converter that reads it is listed itself",
+    "PLL2": "measures; a converter that reads it is listed itself",
+    "FreqDiv": "measures",
     "COI": "averages angle and speed of machines for display",
     "COI2": "averages angle and speed of machines for display",
     "Fault": "an event: faults are stated with the simulation",
@@ -367,7 +370,8 @@ def unsupported(system: Any) -> list[tuple[str, int, list[str]]]:
 
     Devices out of service do not count. A device whose model has a block but which uses it in a way that
     the block does not know is listed under the model and what it asks for. Models that act on nothing in a
-    fault simulation (`IDLE`) are left out.
+    fault simulation (`IDLE`) are left out. A generator of the power flow that no dynamic device stands for
+    would hold its voltage through a fault, and is listed too.
     """
     known = NETWORK | set(IDLE) | {model for models in MADE.values() for model in models}
     found: dict[str, list[str]] = {}
@@ -378,6 +382,16 @@ def unsupported(system: Any) -> list[tuple[str, int, list[str]]]:
                 continue
             for use in _uses(device):
                 found.setdefault(f"{name} with {use}", []).append(str(device.idx))
+    stood_for = {
+        device["gen"]
+        for name, columns in system.models.items()
+        if hasattr(columns, "gen") and hasattr(columns, "u")
+        for device in _devices(system, name)
+    }
+    for name in ("PV", "Slack"):
+        for device in _devices(system, name):
+            if device.idx not in stood_for:
+                found.setdefault(f"{name} without a machine", []).append(str(device.idx))
     return [(model, len(names), names) for model, names in found.items()]
 
 

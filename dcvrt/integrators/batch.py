@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dcvrt.criteria import Criteria, Margins
-from dcvrt.errors import InputError, SimulationError, raise_all
+from dcvrt.errors import InputError, SimulationError
 from dcvrt.functionals import Functional, Outcome, evaluate
 from dcvrt.integrators.asked import Asked
 from dcvrt.trajectory import COMPLETED, Trajectory
@@ -214,12 +214,4 @@ def _cases(
         )
         for k in range(n)
     ]
-    problems: dict[str, None] = {}
-    rows = []
-    for _, values in cases:
-        try:
-            rows.append(simulator.dae.parameter_values(**values))
-        except InputError as error:
-            problems |= dict.fromkeys(str(error).splitlines())
-    raise_all(list(problems), "batch")
-    return cases, np.array(rows)
+    return cases, simulator.dae.parameter_cases([values for _, values in cases], "batch")

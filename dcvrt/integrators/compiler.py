@@ -16,8 +16,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -31,6 +33,8 @@ FLAGS = ("-O2", "-fno-math-errno", "-fPIC", "-shared")
 LONG_FLAGS = ("-O1", *FLAGS[1:])
 LONG_TEXT = 2_000_000
 """Beyond this many characters of C the optimiser costs more than the runs gain."""
+ABANDONED = 3600.0
+"""A compile that is older than this, s, was killed."""
 
 
 class NoCompilerWarning(UserWarning):
@@ -167,6 +171,7 @@ def build(
         return path
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _clear_abandoned(folder)
         place = tempfile.TemporaryDirectory(dir=folder, prefix="build-")
     except OSError as error:
         raise InputError(
@@ -190,6 +195,14 @@ def build(
             )
         os.replace(made, path)
     return path
+
+
+def _clear_abandoned(folder: Path) -> None:
+    """Remove what compilers left behind that were killed: an object has its name only when it is whole."""
+    for scratch in folder.glob("build-*"):
+        with suppress(OSError):  # another process may have been faster
+            if time.time() - scratch.stat().st_mtime > ABANDONED:
+                shutil.rmtree(scratch)
 
 
 @lru_cache(maxsize=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -106,7 +105,7 @@ class Simulator:
         self._models: dict[bool, Model] = {}
         self._kernels: dict[tuple[bool, tuple[str, ...]], KernelModel] = {}
         self._backwards: Backwards | None = None
-        self._last: tuple[Any, ...] = ()
+        self._last: tuple[()] | tuple[Waveform, Channels] = ()
         self._tables: WeakKeyDictionary[Waveform, dict[bool, tuple[Channels, InputTable]]] = (
             WeakKeyDictionary()
         )
@@ -256,16 +255,22 @@ class Simulator:
         self, waveform: Waveform, inputs: Inputs | None, p: Array, tangents: bool
     ) -> KernelRun:
         kernel = self._kernel(tangents)
-        table = self._channels(kernel.equations, waveform, inputs)
+        table, pieces = self._table(kernel, waveform, inputs)
         if self.start == "equilibrium":
             X, Z, found = kernel.rests(p[None], table.first[None], table.first_tangent[None])
             X, Z = (X[0], Z[0]) if found[0] else self._begin(kernel.equations, table, p)
         else:
             X, Z = self._begin(kernel.equations, table, p)
-        return kernel.run(table, p, X, Z, self.save_at)
+        return kernel.run(pieces, p, X, Z, self.save_at)
 
-    def _table(self, kernel: KernelModel, waveform: Waveform) -> tuple[Channels, InputTable]:
-        """Pieces of a waveform as the kernel reads them, kept as long as the waveform lives."""
+    def _table(
+        self, kernel: KernelModel, waveform: Waveform, inputs: Inputs | None = None
+    ) -> tuple[Channels, InputTable]:
+        """Pieces of a waveform as the kernel reads them, kept as long as the waveform lives; not kept with
+        other inputs, which are the caller's to change."""
+        if inputs:
+            pieces = channels(kernel.equations, waveform, inputs)
+            return pieces, InputTable(kernel.equations, pieces)
         known = self._tables.setdefault(waveform, {})
         tangents = kernel.equations.tangents
         if tangents not in known:
@@ -307,9 +312,11 @@ class Simulator:
         return with_gradients(found, Adjoint(self._backwards, run, named, table, slope))
 
     def _channels(self, equations: Equations, waveform: Waveform, inputs: Inputs | None) -> Channels:
-        if not self._last or self._last[0] is not waveform or self._last[1] is not inputs:
-            self._last = (waveform, inputs, channels(equations, waveform, inputs))
-        return self._last[2]
+        if inputs:  # the caller's to change
+            return channels(equations, waveform, inputs)
+        if not self._last or self._last[0] is not waveform:
+            self._last = (waveform, channels(equations, waveform, None))
+        return self._last[1]
 
     def _begin(self, eq: Equations, table: Channels, p: Array) -> tuple[Array, Array]:
         """Start values with their scaled sensitivities beside them."""
@@ -354,7 +361,7 @@ class Simulator:
             t=np.concatenate(t),
             outputs=Signals(dae.y_names, outputs[0][:, :, 0], outputs[1][:, :, 0], sens, rate_sens),
             states=Signals(dae.x_names, all_x[:, : eq.nx], None, x_sens),
-            algebraics=Signals(tuple(r.path for r in dae.algebraics), all_z[:, : eq.nz], None, z_sens),
+            algebraics=Signals(dae.z_names, all_z[:, : eq.nz], None, z_sens),
             events=tuple(run.events),
             status=status,
             parameters=dict(zip(dae.p_names, p.tolist(), strict=True)),

@@ -18,7 +18,7 @@ from dcvrt.models.droop import Droop
 from dcvrt.models.eco_mode import EcoModeControl, Rectifier
 from dcvrt.models.feeder import Feeder
 from dcvrt.models.hold_up_supply import HoldUpSupply
-from dcvrt.models.ledger import StandbyLedger, SupplyLedger, UpsAndDriveLedger, UpsLedger
+from dcvrt.models.ledger import EnergyLedger, StandbyLedger, SupplyLedger, UpsAndDriveLedger, UpsLedger
 from dcvrt.models.limiter import ActivePriorityLimiter, ReactivePriorityLimiter
 from dcvrt.models.line_interactive import LineConditioner, LineInteractiveControl, ParallelConverter
 from dcvrt.models.loads import AuxiliaryLoad, FacilityLoad, ItLoad, ServerSupply, SplitFacilityLoad
@@ -55,6 +55,7 @@ __all__ = [
     "DriveCooling",
     "Droop",
     "EcoModeControl",
+    "EnergyLedger",
     "Equations",
     "FacilityLoad",
     "Feeder",

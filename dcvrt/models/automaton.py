@@ -16,7 +16,7 @@ import casadi as ca
 from dcvrt.dae import Gap
 from dcvrt.errors import did_you_mean
 from dcvrt.models.expressions import text_of
-from dcvrt.models.phasor import Scalar
+from dcvrt.models.phasor import Phasor, Scalar
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,11 @@ class Comparison:
     signal: Scalar
     limit: Scalar
     side: int
+
+    def __post_init__(self) -> None:
+        for value in (self.signal, self.limit):
+            if isinstance(value, Phasor):
+                raise TypeError("a Phasor is neither above nor below a limit")
 
     @property
     def margin(self) -> Scalar:
@@ -63,6 +68,9 @@ class Guard:
 
     def __and__(self, other: Guard) -> Guard:
         return Guard(tuple(mine + yours for mine, yours in itertools.product(self.cases, other.cases)))
+
+    def __bool__(self) -> bool:
+        raise TypeError("a guard is neither true nor false while the table is written")
 
     def __str__(self) -> str:
         return " or ".join(" and ".join(map(str, case)) if case else "always" for case in self.cases)
@@ -109,6 +117,10 @@ class Go:
     reset: Mapping[str, Scalar] = field(default_factory=dict)
     settles: str = ""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.when, Guard):
+            raise TypeError(f"{self.source} -> {self.target}: {self.when} is no guard")
+
     def __str__(self) -> str:
         timed = "" if text_of(self.held) == "0" else f" held {text_of(self.held)}"
         return f"{self.source} -> {self.target}: {self.when}{timed}"
@@ -116,6 +128,8 @@ class Go:
 
 def check_table(modes: Sequence[str], start: str, rows: Sequence[Go]) -> list[str]:
     """Problems of a table of modes: unknown, unreachable and dead-end modes."""
+    if not isinstance(rows, tuple | list) or not all(isinstance(row, Go) for row in rows):
+        return ["transitions() must return a tuple of rows: (Go('OFF', 'ON', guard), ...)."]
     if start not in modes:
         return [f"the start mode {start!r} is not one of its modes.{did_you_mean(start, modes)}"]
     problems = [

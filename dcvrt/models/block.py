@@ -5,14 +5,13 @@ The same `equations` run on numbers (in tests, by hand) and on CasADi symbols (w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import casadi as ca
 
-from dcvrt.errors import InputError, ModelError, did_you_mean, outside, raise_all
+from dcvrt.errors import InputError, ModelError, did_you_mean, is_number, raise_all
 from dcvrt.models.automaton import Go
 from dcvrt.models.declared import (
     Algebraic,
@@ -26,8 +25,8 @@ from dcvrt.models.declared import (
     State,
     UnknownNameError,
 )
+from dcvrt.models.evaluation import Equations, on_symbols, stack
 from dcvrt.models.phasor import Phasor, Scalar
-from dcvrt.units import dimension
 
 __all__ = [
     "Algebraic",
@@ -40,7 +39,6 @@ __all__ = [
     "Port",
     "State",
     "UnknownNameError",
-    "check_equations",
 ]
 
 RESERVED = {"values", "sources", "clock", "mode"}
@@ -48,18 +46,6 @@ RESERVED = {"values", "sources", "clock", "mode"}
 
 SHORTEST = 1e-6
 """Time constants that are not 0 may be set down to here, s, once they are compiled."""
-
-
-@dataclass(frozen=True)
-class Equations:
-    """What a block's equations give: derivatives by state, outputs, residuals by algebraic variable.
-
-    For a state that names its time constant T, `der` holds the right side of T dx/dt = ...
-    """
-
-    der: Mapping[str, Scalar] = field(default_factory=dict)
-    out: Mapping[str, Scalar | Phasor] = field(default_factory=dict)
-    alg: Mapping[str, Scalar] = field(default_factory=dict)
 
 
 class Namespace(SimpleNamespace):
@@ -89,6 +75,8 @@ class Block(Part):
     modes: ClassVar[tuple[str, ...]] = ()
     start: ClassVar[str] = ""
     flags: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    optional_terms: ClassVar[bool] = False
+    """Whether its values decide which terms the equations have, so that a parameter may be without effect."""
     _declared: ClassVar[dict[str, Declared]] = {}
 
     def __init_subclass__(cls) -> None:
@@ -99,12 +87,9 @@ class Block(Part):
             for name, d in vars(base).items()
             if isinstance(d, Declared)
         }
-        problems = []
+        problems: list[str] = []
         for name, d in cls._declared.items():
-            try:
-                dimension(d.unit)
-            except ModelError as error:
-                problems.append(f"{name}: {error}")
+            problems += d.problems()
             if hasattr(Block, name) or name in RESERVED - ({"mode"} if isinstance(d, Output) else set()):
                 problems.append(f"{name!r} is a name that every block has; choose another.")
             if isinstance(d, State) and d.time:
@@ -114,14 +99,26 @@ class Block(Part):
                         f"{name}: its time constant {d.time!r} must be a parameter of the block in s, "
                         "with bounds from 0 on."
                     )
+        if isinstance(cls.modes, str) or len(set(cls.modes)) < len(cls.modes):
+            problems.append(f"modes = {cls.modes!r} must be a tuple of different names: ('OFF', 'ON').")
+        elif not cls.modes and cls.transitions is not Block.transitions:
+            problems.append("there are transitions, but no modes. Declare modes and start.")
         for flag, column in cls.flags.items():
             if flag in cls._declared:
                 problems.append(f"the flag {flag!r} has the name of a symbol of the block.")
-            if len(column) != len(cls.modes):
+            if not isinstance(column, tuple | list) or not all(map(is_number, column)):
+                problems.append(f"the flag {flag!r} is {column!r}, not one number for each mode: (0.0, 1.0).")
+            elif len(column) != len(cls.modes):
                 problems.append(f"the flag {flag!r} has {len(column)} values for {len(cls.modes)} modes.")
         raise_all(problems, cls.__name__, ModelError)
 
-    def __init__(self, **values: float) -> None:
+    def __init__(self, *unnamed: float, **values: float) -> None:
+        if unnamed:
+            first = next(iter(self.declared(Parameter)), "name")
+            raise InputError(
+                f"{type(self).__name__}: values are given by name: "
+                f"{type(self).__name__}({first}={unnamed[0]!r})."
+            )
         self.values = {name: p.value for name, p in self.declared(Parameter).items()}
         self.sources = {name: p.source for name, p in self.declared(Parameter).items()}
         problems = [problem for name, value in values.items() if (problem := self.problem_of(name, value))]
@@ -139,10 +136,7 @@ class Block(Part):
         known = self.declared(Parameter)
         if parameter not in known:
             return f"there is no parameter {parameter!r}.{did_you_mean(parameter, known)}"
-        low, high = known[parameter].bounds
-        if not low <= value <= high:
-            return outside(parameter, value, known[parameter].unit, known[parameter].bounds)
-        return ""
+        return known[parameter].refusal(value, parameter)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -153,7 +147,10 @@ class Block(Part):
 
     def equations(self, s: Any) -> Equations:
         """Derivatives, outputs and residuals as pure functions of the namespace `s`."""
-        raise NotImplementedError(f"{type(self).__name__} gives no equations.")
+        raise ModelError(
+            f"{type(self).__name__} gives no equations. Write equations(self, s), which returns "
+            "Equations(der=..., out=...)."
+        )
 
     def transitions(self, s: Any) -> tuple[Go, ...]:
         """Rows of the table of modes, tried from top to bottom."""
@@ -251,7 +248,7 @@ class Block(Part):
         {'i': ('v', 'delta', 'p_c', 'q_c'), 'v_dq': ('v', 'delta')}
         """
         s = self.symbols(self.name or type(self).__name__)
-        out = self.equations(s).out
+        out = on_symbols(self, "equations", s).out
         inputs = self.declared(Input)
         return {
             name: tuple(k for k in inputs if ca.depends_on(stack([out[name]]), stack([getattr(s, k)])))
@@ -272,39 +269,3 @@ class Block(Part):
             else:
                 inside = False
         return notes
-
-
-def stack(columns: Iterable[Any]) -> ca.SX:
-    """Numbers, symbols, columns and phasors in one column of SX."""
-    flat: list[Any] = []
-    for value in columns:
-        flat += [value.re, value.im] if isinstance(value, Phasor) else [value]
-    joined: Any = ca.vertcat(*flat) if flat else ca.SX(0, 1)
-    return ca.SX(joined)
-
-
-def check_equations(path: str, block: Block, eq: Any) -> list[str]:
-    """Problems of what `equations` gave: missing, undeclared, of the wrong kind."""
-    who = f"{path} ({type(block).__name__})"
-    if not isinstance(eq, Equations):
-        return [f"{who}: equations() must return Equations(der=..., out=...), not {type(eq).__name__}."]
-    problems = []
-    for what, given, wanted in (
-        ("the derivative of state", eq.der, block.declared(State)),
-        ("the output", eq.out, block.declared(Output)),
-        ("the residual of algebraic variable", eq.alg, block.declared(Algebraic)),
-    ):
-        for name in wanted:
-            if name not in given:
-                problems.append(f"{who}: no equation for {what} {name!r}.")
-            elif (wanted[name].kind is Phasor) != isinstance(given[name], Phasor):
-                problems.append(
-                    f"{who}: {what} {name!r} is declared as {wanted[name].kind.__name__}, "
-                    f"but its equation gives {type(given[name]).__name__}."
-                )
-        for name in given:
-            if name not in wanted:
-                problems.append(
-                    f"{who}: equation for {what} {name!r}, which is not declared.{did_you_mean(name, wanted)}"
-                )
-    return problems

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from dcvrt.dae import Automaton, Dae, Row
+from dcvrt.dae import Automaton, Dae, Row, Tied
 from dcvrt.errors import ModelError, did_you_mean, raise_all
 from dcvrt.models.algebraic import check_regular
-from dcvrt.models.block import (
-    Algebraic,
-    Equations,
-    Input,
-    Output,
-    Parameter,
-    State,
-    check_equations,
-    stack,
-)
-from dcvrt.models.declared import Declared
+from dcvrt.models.automaton import Go
+from dcvrt.models.declared import Algebraic, Declared, Input, Output, Parameter, State
 from dcvrt.models.diagram import Diagram
+from dcvrt.models.evaluation import Equations, check_equations, on_symbols, stack
 from dcvrt.models.expressions import text_of
 from dcvrt.models.netlist import Netlist, netlist
-from dcvrt.models.phasor import Phasor
+from dcvrt.models.phasor import Phasor, Scalar
 from dcvrt.models.structure import structure_problems
 from dcvrt.models.table import build_automaton
 from dcvrt.models.wiring import End, path_of
@@ -67,9 +59,13 @@ class Flattener:
         self.net = net
         self.s = {path: block.symbols(path) for path, block in net.blocks.items()}
         self.eq: dict[str, Equations] = {}
+        self.rows: dict[str, tuple[Go, ...]] = {}
+        self.rests: dict[str, Mapping[str, Scalar]] = {}
         problems = []
         for path, block in net.blocks.items():
-            given = block.equations(self.s[path])
+            given = on_symbols(block, "equations", self.s[path])
+            self.rows[path] = on_symbols(block, "transitions", self.s[path])
+            self.rests[path] = on_symbols(block, "rest", self.s[path])
             wrong = check_equations(path, block, given)
             problems += wrong
             self.eq[path] = given if wrong else block.reduced(given, self.s[path])
@@ -89,6 +85,22 @@ class Flattener:
         found = self.net.find(end)
         assert found is not None
         return found
+
+    def idle(self, path: str) -> Iterator[str]:
+        """Parameters of a block that it does not use: whoever set them would see no effect."""
+        block, s, eq = self.net.blocks[path], self.s[path], self.eq[path]
+        if block.optional_terms:
+            return
+        used = [*eq.der.values(), *eq.out.values(), *eq.alg.values(), *self.rests[path].values()]
+        for row in self.rows[path]:
+            used += [row.when.margin, row.held, *row.reset.values()]
+        lags = {state.time for state in block.declared(State).values()}  # a time constant may be 0
+        for name in (name for name in block.declared(Parameter) if name not in lags):
+            if not ca.depends_on(stack(used), getattr(s, name)):
+                yield (
+                    f"{path} ({block.label}): nothing depends on the parameter {name!r}. Equations read "
+                    f"s.{name}; self.{name} is a number that no run can change. Use it or drop it."
+                )
 
     def time_problems(self) -> list[str]:
         """Time constants that are bound to something whose being 0 or not is another than the block's own."""
@@ -221,6 +233,15 @@ class Flattener:
                     symbols.append(getattr(self.s[name], key))
         return rows, stack(symbols)
 
+    def tied(self) -> Iterator[Tied]:
+        """The parameters of blocks that are bound, each with the range that its block allows."""
+        for (path, name), expression in self.net.bindings.items():
+            if path in self.net.blocks:
+                block = self.net.blocks[path]
+                d = block.declared(Parameter)[name]
+                what = f"{path}.{name} (bound to {text_of(expression)})"
+                yield Tied(what, d.unit, block.settable(name), ca.SX(expression))
+
     def inputs(self) -> list[Row]:
         """Rows of the inputs with their values at rest."""
         rows = []
@@ -274,6 +295,7 @@ def flatten(diagram: Diagram) -> Dae:
     algebraics = tuple(unknown.row for unknown in unknowns)
     check_regular(diagram.name, g, z, algebraics)
     automata = tuple(build_automaton(flat, name, p) for name, b in flat.net.blocks.items() if b.modes)
+    raise_all([problem for path in flat.net.blocks for problem in flat.idle(path)], diagram.name, ModelError)
     dae = Dae(
         name=diagram.name,
         t=ca.SX.sym("t"),
@@ -295,16 +317,25 @@ def flatten(diagram: Diagram) -> Dae:
         automata=automata,
         start=start_values(flat, x, z, unknowns, automata),
         notes=tuple(f"{name}: {note}" for name, block in flat.net.blocks.items() for note in block.notes()),
+        tied=(*flat.tied(), *dwell_times(automata)),
     )
-    raise_all(dae.chatter(dae.parameter_values()), diagram.name, ModelError)
+    raise_all(dae.conflicts(dae.parameter_values()), diagram.name, ModelError)
     return dae
+
+
+def dwell_times(automata: tuple[Automaton, ...]) -> Iterator[Tied]:
+    """The dwell times of all rows, which must not be negative."""
+    for a in automata:
+        for row in a.rows:
+            if not row.held.is_zero():
+                yield Tied(f"{a.path}: the dwell time of '{row.text}'", "s", (0.0, np.inf), row.held)
 
 
 def start_values(
     flat: Flattener, x: ca.SX, z: ca.SX, unknowns: list[Unknown], automata: tuple[Automaton, ...]
 ) -> ca.SX:
     """Start values as functions of `u` and `p`: what the blocks say of their rest, through the wires."""
-    rests = {name: block.rest(flat.s[name]) for name, block in flat.net.blocks.items()}
+    rests = flat.rests
     problems = []
     for name, block in flat.net.blocks.items():
         states = block.declared(State)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import inf
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from dcvrt.errors import ModelError, did_you_mean
+import casadi as ca
+
+from dcvrt.errors import ModelError, did_you_mean, is_number, outside, refusal
+from dcvrt.models.phasor import Phasor
+from dcvrt.units import BASES, dimension
 
 if TYPE_CHECKING:
     from dcvrt.models.diagram import Diagram
@@ -16,14 +21,22 @@ class UnknownNameError(ModelError, AttributeError):
     """A symbol or port that a block or a diagram does not declare."""
 
 
+def as_float(value: Any) -> Any:
+    """A number as a float; anything else as it is, for :meth:`Declared.problems` to tell."""
+    return float(value) if is_number(value) else value
+
+
 @dataclass(eq=False)
 class Declared:
     """Something that a block declares by name."""
 
+    form: ClassVar[str] = ""
+    """How it is written, for messages."""
+
     name: str = field(default="", init=False)
     unit: str = ""
     doc: str = ""
-    kind: type = field(default=float, kw_only=True)
+    kind: type = float
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -31,10 +44,38 @@ class Declared:
     def __get__(self, block: Any, owner: type | None = None) -> Any:
         return self if block is None else Port(block, self)
 
+    def problems(self) -> Iterator[str]:
+        """What is wrong with the declaration itself."""
+        if not isinstance(self.unit, str):
+            yield f"{self.name}: the unit is {self.unit!r}, not a text. Write {self.form}."
+        else:
+            try:
+                dimension(self.unit)
+            except ModelError as error:
+                yield f"{self.name}: {error}"
+                if self.doc in BASES:
+                    yield f"{self.name}: unit and meaning have changed places. Write {self.form}."
+        if not isinstance(self.doc, str):
+            yield f"{self.name}: the meaning is {self.doc!r}, not a text. Write {self.form}."
+        if self.kind not in (float, Phasor):
+            yield f"{self.name}: the kind is {self.kind!r}. It is float, for a number, or Phasor."
+
+    def value_problems(self, value: Any, bounds: Any, what: str) -> Iterator[str]:
+        """What is wrong with a value and the range that it is to lie in."""
+        pair = tuple(bounds) if isinstance(bounds, tuple | list) else ()
+        if not is_number(value):
+            yield f"{self.name}: the {what} is {value!r}, not a number. Write {self.form}."
+        if len(pair) != 2 or not all(map(is_number, pair)) or not pair[0] <= pair[1]:
+            yield f"{self.name}: the bounds are {bounds!r}, not two numbers (low, high). Write {self.form}."
+        elif is_number(value) and not pair[0] <= value <= pair[1]:
+            yield outside(self.name, value, self.unit, bounds)
+
 
 @dataclass(eq=False)
 class Parameter(Declared):
     """A constant of the block: value, unit, range it may be set in, meaning, source of the value."""
+
+    form: ClassVar[str] = "Parameter(1.0, 's', (0.1, 10.0), 'meaning', 'source')"
 
     value: float = 0.0
     bounds: tuple[float, float] = (-inf, inf)
@@ -49,7 +90,17 @@ class Parameter(Declared):
         source: str = "not stated",
     ) -> None:
         self.name, self.unit, self.doc, self.kind = "", unit, doc, float
-        self.value, self.bounds, self.source = float(value), bounds, source
+        self.value, self.bounds, self.source = as_float(value), bounds, source
+
+    def problems(self) -> Iterator[str]:
+        yield from super().problems()
+        yield from self.value_problems(self.value, self.bounds, "value")
+
+    def refusal(self, value: Any, path: str) -> str:
+        """Why it cannot have this value, at this path; an empty text when it can."""
+        if isinstance(value, ca.SX):
+            return f"{path} = {value} is an expression; a value is a number. Tie it with the diagram's bind."
+        return refusal(path, value, self.unit, self.bounds)
 
     def __get__(self, block: Any, owner: type | None = None) -> Any:
         return self if block is None else block.values[self.name]
@@ -59,10 +110,14 @@ class Parameter(Declared):
 class Input(Declared):
     """A signal that another block, or the diagram, must feed."""
 
+    form: ClassVar[str] = "Input('pu(V)', 'meaning')"
+
 
 @dataclass(eq=False)
 class Output(Declared):
     """A signal that the block computes."""
+
+    form: ClassVar[str] = "Output('pu(V)', 'meaning')"
 
 
 @dataclass(eq=False)
@@ -75,6 +130,8 @@ class State(Declared):
     `time` names the parameter that is its time constant T. Its equation is then given as the right side of
     T dx/dt = ..., and on a block where T is 0 it is no state but the variable that 0 = ... defines.
     """
+
+    form: ClassVar[str] = "State(0.0, 'pu(V)', 'meaning')"
 
     start: float = 0.0
     bounds: tuple[float, float] = (-inf, inf)
@@ -91,17 +148,27 @@ class State(Declared):
         time: str = "",
     ) -> None:
         self.name, self.unit, self.doc, self.kind = "", unit, doc, float
-        self.start, self.bounds, self.crossing, self.time = float(start), bounds, crossing, time
+        self.start, self.bounds, self.crossing, self.time = as_float(start), bounds, crossing, time
+
+    def problems(self) -> Iterator[str]:
+        yield from super().problems()
+        yield from self.value_problems(self.start, self.bounds, "start value")
 
 
 @dataclass(eq=False)
 class Algebraic(Declared):
     """A variable defined by an equation 0 = residual."""
 
+    form: ClassVar[str] = "Algebraic(1.0, 'pu(V)', 'meaning')"
+
     start: float = 0.0
 
     def __init__(self, start: float, unit: str, doc: str = "") -> None:
-        self.name, self.unit, self.doc, self.kind, self.start = "", unit, doc, float, float(start)
+        self.name, self.unit, self.doc, self.kind, self.start = "", unit, doc, float, as_float(start)
+
+    def problems(self) -> Iterator[str]:
+        yield from super().problems()
+        yield from self.value_problems(self.start, (-inf, inf), "start value")
 
 
 @dataclass(frozen=True)

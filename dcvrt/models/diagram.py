@@ -10,11 +10,19 @@ from typing import Any, Literal, TypeVar
 import casadi as ca
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, ModelError, did_you_mean, outside
-from dcvrt.models.declared import D, Declared, Input, Output, Parameter, Part, Port
+from dcvrt.errors import InputError, ModelError, did_you_mean, is_number, raise_all
+from dcvrt.models.declared import (
+    D,
+    Declared,
+    Input,
+    Output,
+    Parameter,
+    Part,
+    Port,
+    UnknownNameError,
+)
 from dcvrt.models.phasor import Scalar
 from dcvrt.models.wiring import End, Wire, driven_twice
-from dcvrt.units import dimension
 
 P = TypeVar("P", bound=Part)
 
@@ -70,12 +78,15 @@ class Diagram(Part):
     """Errors of wiring seen so far; `compile` reports them with its own."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError("a diagram needs a name: Diagram('mine').")
         self.title = self.name
 
     # ---- parts ----------------------------------------------------------------------------------------
 
     def add(self, name: str, block: P) -> P:
         """Add a block, or a diagram as one, under a name, and return it."""
+        self._check_part(name, block)
         if name in self.blocks or name in self.shared or name in self.inputs:
             self.problems.append(f"the name {name!r} is taken. Add the second {block.label} under another.")
         elif "." in name:
@@ -104,13 +115,11 @@ class Diagram(Part):
         source: str = "not stated",
     ) -> ca.SX:
         """A parameter of the whole diagram, as a symbol for the expressions that `bind` takes."""
-        dimension(unit)
         declared = Parameter(value, unit, bounds, doc, source)
         declared.name = name
+        raise_all(list(declared.problems()), self.name, InputError)
         if name in self.shared or name in self.blocks or name in self.inputs:
             self.problems.append(f"the name {name!r} of a parameter is taken.")
-        if not bounds[0] <= value <= bounds[1]:
-            raise InputError(outside(name, value, unit, bounds))
         self.shared[name] = Shared(ca.SX.sym(name), declared)
         return self.shared[name].symbol
 
@@ -118,9 +127,9 @@ class Diagram(Part):
         self, name: str, unit: str, kind: type = float, rest: complex | None = None, doc: str = ""
     ) -> Port:
         """An input of the whole diagram; `rest` is its value before anything happens (phasor 1, number 0)."""
-        dimension(unit)
         declared = Input(unit, doc, kind=kind)
         declared.name = name
+        raise_all(list(declared.problems()), self.name, InputError)
         if name in self.inputs or name in self.blocks or name in self.shared:
             self.problems.append(f"the name {name!r} of an input is taken.")
         self.inputs[name] = (declared, rest if rest is not None else 0.0 if kind is float else 1.0)
@@ -165,18 +174,28 @@ class Diagram(Part):
 
     def bind(self, block: Part, **expressions: Scalar) -> None:
         """Tie parameters of a part to expressions of the diagram's parameters."""
+        if not isinstance(block, Part):
+            self.problems.append(f"bind: {block!r} is not a block. Give the block that add returned.")
+            return
         path = self._path(block)
         if not path:
             self.problems.append(f"bind: {block.label} was not added to this diagram.")
             return
         for name, expression in expressions.items():
-            self.bindings[path, name] = expression
+            if isinstance(expression, ca.SX) or is_number(expression):
+                self.bindings[path, name] = expression
+            else:
+                self.problems.append(
+                    f"bind: {path}.{name} = {expression!r} is neither a number nor an expression of what "
+                    "parameter() returned."
+                )
 
     def replace(self, name: str, block: P) -> P:
         """Put another part in the place of one: wires and bindings stay, its own values come with it.
 
         `name` may be a path into a diagram that is a part of this one.
         """
+        self._check_part(name, block)
         self._known_part(name)
         outer, _, local = name.rpartition(".")
         owner: Any = self.part(outer) if outer else self
@@ -213,9 +232,8 @@ class Diagram(Part):
             near = [known for known in places if known.rpartition(".")[0] == block_path]
             raise InputError(f"{self.name} has no parameter {path!r}.{did_you_mean(path, near or places)}")
         declared = places[path]
-        low, high = declared.bounds
-        if not low <= value <= high:
-            raise InputError(outside(path, value, declared.unit, declared.bounds))
+        if refusal := declared.refusal(value, path):
+            raise InputError(refusal)
         if path in flat.shared:
             declared.value, declared.source = float(value), source
         else:
@@ -323,11 +341,26 @@ class Diagram(Part):
         if name in self.shared:
             return self.shared[name].declared.value
         known = self.declared(Declared)
+        if name not in known and name in Dae.__dataclass_fields__:
+            raise UnknownNameError(
+                f"{self.title} is a diagram, and {name!r} belongs to a system. Compile it first: "
+                f"{self.title}.compile()."
+            )
         if name not in known:
             raise self.unknown(name)
         return Port(self, known[name])
 
     # ---- helpers --------------------------------------------------------------------------------------
+
+    def _check_part(self, name: Any, part: Any) -> None:
+        """Refuse what can be no part of a diagram before it is taken in."""
+        if isinstance(part, type) and issubclass(part, Part):
+            raise ModelError(
+                f"{self.name}: {name!r} is given the class {part.__name__}, not a block. "
+                f"Make one: {part.__name__}()."
+            )
+        if not isinstance(name, str) or not isinstance(part, Part):
+            raise ModelError(f"{self.name}: add and replace take a name and a block: add('pll', Pll()).")
 
     def _find(self, end: End) -> Declared | None:
         """What stands at the end of a wire."""
@@ -355,9 +388,13 @@ class Diagram(Part):
 
     def _end(self, port: Any) -> End | None:
         if not isinstance(port, Port):
-            self.problems.append(
-                f"{port!r} is not a port. Take ports from blocks (pll.delta) or from input()."
-            )
+            if isinstance(port, ca.SX):
+                told = f"{port} is a parameter of the diagram, not a port. Use bind(block, name={port})."
+            elif is_number(port):
+                told = f"{port!r} is a number, not a port. A parameter gets its value from set or bind."
+            else:
+                told = f"{port!r} is not a port. Take ports from blocks (pll.delta) or from input()."
+            self.problems.append(told)
             return None
         if port.block is None:
             known = self.inputs.get(port.declared.name)

@@ -7,12 +7,17 @@ from typing import Any
 
 from dcvrt.models import smooth
 from dcvrt.models.automaton import Go, above, below
-from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
-from dcvrt.models.internal_voltage import effective_command, internal_voltage_at_rest, virtual_current
+from dcvrt.models.block import Equations, Input, Output, Parameter, State
+from dcvrt.models.internal_voltage import (
+    GridForming,
+    effective_command,
+    internal_voltage_at_rest,
+    virtual_current,
+)
 from dcvrt.models.phasor import Phasor
 
 
-class Droop(Block):
+class Droop(GridForming):
     r"""Voltage source behind a virtual impedance whose frequency and magnitude fall with measured powers.
 
     .. math::
@@ -55,43 +60,13 @@ class Droop(Block):
     start = "FREE"
     flags = {"free": (1, 0)}  # noqa: RUF012
 
-    H = Parameter(
-        1.0, "pu(S)", (1e-6, 1e3), "hosted capacity, the base of the impedance", "decision of the planner"
-    )
     m_p = Parameter(0.033, "1", (1e-3, 0.2), "frequency droop: frequency over power", "ANDES REGF1: 0.033")
     K_Q = Parameter(0.045, "pu(V)/pu(S)", (0.0, 1.0), "reactive droop over H", "ANDES REGF1: 0.045")
     T_f = Parameter(5e-3, "s", (5e-4, 1.0), "time constant of the power measurement", "ANDES REGF1: 5 ms")
-    R_v = Parameter(0.02, "pu(V)/pu(I)", (0.0, 0.5), "virtual resistance on H", "illustrative")
-    X_v = Parameter(
-        0.2, "pu(V)/pu(I)", (0.02, 1.0), "virtual reactance on H", "PSID test data; ANDES REGF1 xf"
-    )
-    f_B = Parameter(60.0, "Hz", (45.0, 65.0), "nominal frequency", "North American grid")
-    E_min = Parameter(0.7, "pu(V)", (0.0, 1.0), "lowest internal voltage", "illustrative")
-    E_max = Parameter(1.25, "pu(V)", (1.0, 2.0), "highest internal voltage", "illustrative")
-    T_0 = Parameter(
-        5.0,
-        "s",
-        (0.1, 600.0),
-        "trim of the set point, per pu(S)/pu(V)",
-        "own choice: far slower than a fault",
-    )
-    K_s = Parameter(30.0, "rad/s/pu(V)", (0.0, 500.0), "gain of the resynchronisation", "illustrative")
     V_freeze = Parameter(0.8, "pu(V)", (0.0, 1.0), "freeze below", "ANDES REGF1: Vdip 0.8")
     V_thaw = Parameter(0.85, "pu(V)", (0.0, 1.0), "free again above", "illustrative: hysteresis")
-    eps = Parameter(2e-3, "1", (1e-6, 0.1), "width of the blends, over H", "own choice: numerics")
 
-    v = Input("pu(V)", "POI voltage, network frame", kind=Phasor)
     v_f = Input("pu(V)", "measured POI voltage")
-    p_c = Input("pu(S)", "active-power command")
-    q_c = Input("pu(S)", "reactive-power command")
-    p_g = Input("pu(S)", "active import achieved")
-    q_g = Input("pu(S)", "reactive import achieved")
-    shortfall = Input("pu(I)", "active current asked for beyond the limit")
-    resync = Input("1", "1: align with the grid voltage, unloaded")
-    trim = Input("1", "1: trim the voltage set point")
-    i = Output("pu(I)", "current asked for, dq frame", kind=Phasor)
-    v_dq = Output("pu(V)", "POI voltage, dq frame", kind=Phasor)
-    error = Output("pu(V)", "voltage across the frame: 0 when aligned without load")
     omega = Output("1", "internal frequency over the nominal one")
     E = Output("pu(V)", "magnitude of the internal voltage")
 

@@ -8,14 +8,13 @@ from dcvrt.models import smooth
 from dcvrt.models.automaton import Go, below, outside, within
 from dcvrt.models.block import Block, Equations, Input, Output, Parameter
 from dcvrt.models.command import given
-from dcvrt.models.line_interactive import THREE_DEGREES
 from dcvrt.models.phasor import Phasor
+from dcvrt.models.standby_control import StandbyControl
 
-BAND = "illustrative: +-10 % is the usual bypass window"
 RECTIFIER = "illustrative; a Staco FirstLine carries its rated load down to 0.80"
 
 
-class EcoModeControl(Block):
+class EcoModeControl(StandbyControl):
     """Decides between bypass, battery and double conversion.
 
     | mode | meaning |
@@ -46,10 +45,6 @@ class EcoModeControl(Block):
         "living":     (1, 1, 1, 1, 0),
     }  # fmt: skip
 
-    V_low = Parameter(0.90, "pu(V)", (0.3, 1.0), "leave the bypass below", BAND)
-    V_high = Parameter(1.10, "pu(V)", (1.0, 1.5), "leave the bypass above", BAND)
-    V_back = Parameter(0.92, "pu(V)", (0.3, 1.05), "bypass healthy above", BAND)
-    V_calm = Parameter(1.08, "pu(V)", (0.95, 1.5), "bypass healthy below", BAND)
     V_stop = Parameter(0.78, "pu(V)", (0.2, 1.0), "rectifier stops below", RECTIFIER)
     V_over = Parameter(1.15, "pu(V)", (1.0, 1.5), "rectifier stops above", RECTIFIER)
     V_go = Parameter(0.80, "pu(V)", (0.2, 1.05), "rectifier starts above", RECTIFIER)
@@ -61,32 +56,15 @@ class EcoModeControl(Block):
         300.0, "s", (0.0, 1e5), "healthy time in DOUBLE before ECO",
         "Eaton 9PX: 5 minutes of bypass monitoring; Eaton 9395 on high alert: 1 h",
     )  # fmt: skip
-    e_sync = Parameter(
-        0.052, "pu(V)", (1e-3, 0.5), "largest voltage across the inverter's axis", THREE_DEGREES
-    )
-    soc_min = Parameter(0.1, "1", (0.0, 0.9), "charge at which the inverter stops", "illustrative")
 
-    v_f = Input("pu(V)", "measured input voltage")
-    error = Input("pu(V)", "input voltage across the inverter's axis")
-    soc = Input("1", "state of charge")
-    walked = Input("1", "share of the load walked in")
-    done = Input("1", "1 once all of it is")
-    transfer = Output("1", "1: switch away from the bypass")
-    walk = Output("1", "1: walk the rectifier in")
-    share = Output("1", "share of the inverter's load that the rectifier carries")
     rectify = Output("1", "1: rectifier on")
-    charge = Output("1", "1: battery may recharge")
-    align = Output("1", "1: inverter follows the input")
-    on = Output("1", "1: inverter on")
-    mode = Output("1", "number of the mode, from 0")
 
     def transitions(self, s: Any) -> tuple[Go, ...]:
-        unfit = outside(s.v_f, s.V_low, s.V_high)
         lost = outside(s.v_f, s.V_stop, s.V_over)
         usable = within(s.v_f, s.V_go, s.V_under)
-        healthy = within(s.v_f, s.V_back, s.V_calm) & within(s.error, -s.e_sync, s.e_sync)
+        healthy = self.healthy(s) & self.synchronous(s)
         return (
-            Go("ECO", "BATTERY", unfit),
+            Go("ECO", "BATTERY", self.unfit(s)),
             Go("BATTERY", "DOWN", below(s.soc, s.soc_min)),
             Go("BATTERY", "WALK_IN", usable, held=s.T_start),
             Go("WALK_IN", "BATTERY", lost),
@@ -97,18 +75,7 @@ class EcoModeControl(Block):
         )
 
     def equations(self, s: Any) -> Equations:
-        return Equations(
-            out=dict(
-                transfer=s.away,
-                walk=s.handing,
-                share=s.handed + s.handing * s.walked,
-                rectify=s.rectifying,
-                charge=s.charging,
-                align=s.following,
-                on=s.living,
-                mode=s.number,
-            )
-        )
+        return Equations(out={**self.says(s), "rectify": s.rectifying})
 
 
 class Rectifier(Block):

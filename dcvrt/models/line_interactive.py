@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from dcvrt.models import smooth
-from dcvrt.models.automaton import Go, below, outside, within
+from dcvrt.models.automaton import Go, below
 from dcvrt.models.block import Block, Equations, Input, Output, Parameter, State
 from dcvrt.models.command import given
 from dcvrt.models.phasor import Phasor
+from dcvrt.models.standby_control import StandbyControl
 
-BAND = "illustrative: +-10 % is the usual bypass window"
 QUALIFY = "3, 10 or 30 s can be set at a Prolink PRO; the default of 3 s there"
-THREE_DEGREES = "3 degrees: UFGS 16265, static bypass transfer"
 
 
-class LineInteractiveControl(Block):
+class LineInteractiveControl(StandbyControl):
     """Decides whether the line or the battery carries the load.
 
     | mode | meaning |
@@ -43,58 +42,24 @@ class LineInteractiveControl(Block):
         "living":     (1, 1, 1, 1, 0),
     }  # fmt: skip
 
-    V_low = Parameter(0.90, "pu(V)", (0.3, 1.0), "leave the line below", BAND)
-    V_high = Parameter(1.10, "pu(V)", (1.0, 1.5), "leave the line above", BAND)
-    V_back = Parameter(0.92, "pu(V)", (0.3, 1.05), "line healthy above", BAND)
-    V_calm = Parameter(1.08, "pu(V)", (0.95, 1.5), "line healthy below", BAND)
     T_qualify = Parameter(3.0, "s", (0.0, 3600.0), "healthy and synchronous time before return", QUALIFY)
-    e_sync = Parameter(
-        0.052, "pu(V)", (1e-3, 0.5), "largest voltage across the inverter's axis", THREE_DEGREES
-    )
-    soc_min = Parameter(0.1, "1", (0.0, 0.9), "charge at which the inverter stops", "illustrative")
-
-    v_f = Input("pu(V)", "measured line voltage")
-    error = Input("pu(V)", "line voltage across the inverter's axis")
-    soc = Input("1", "state of charge")
-    walked = Input("1", "share of the load walked in")
-    done = Input("1", "1 once all of it is")
-    transfer = Output("1", "1: switch away from the line")
-    walk = Output("1", "1: walk the load in")
-    share = Output("1", "share of the load that the line carries")
-    charge = Output("1", "1: battery may recharge")
-    align = Output("1", "1: inverter follows the line")
-    on = Output("1", "1: inverter on")
-    mode = Output("1", "number of the mode, from 0")
 
     def transitions(self, s: Any) -> tuple[Go, ...]:
-        unfit = outside(s.v_f, s.V_low, s.V_high)
-        healthy = within(s.v_f, s.V_back, s.V_calm)
-        synchronous = within(s.error, -s.e_sync, s.e_sync)
-        empty = below(s.soc, s.soc_min)
+        unfit, healthy, empty = self.unfit(s), self.healthy(s), below(s.soc, s.soc_min)
         return (
             Go("LINE", "BATTERY", unfit),
             Go("BATTERY", "DOWN", empty),
             Go("BATTERY", "SYNCHRONISE", healthy),
             Go("SYNCHRONISE", "DOWN", empty),
             Go("SYNCHRONISE", "BATTERY", unfit),
-            Go("SYNCHRONISE", "RETURN", healthy & synchronous, held=s.T_qualify),
+            Go("SYNCHRONISE", "RETURN", healthy & self.synchronous(s), held=s.T_qualify),
             Go("RETURN", "BATTERY", unfit),
             Go("RETURN", "LINE", given(s.done)),
             Go("DOWN", "LINE", healthy, held=s.T_qualify),
         )
 
     def equations(self, s: Any) -> Equations:
-        return Equations(
-            out=dict(
-                transfer=s.away,
-                walk=s.handing,
-                share=s.handed + s.handing * s.walked,
-                charge=s.charging,
-                align=s.following,
-                on=s.living,
-                mode=s.number,
-            )
-        )
+        return Equations(out=self.says(s))
 
 
 class LineConditioner(Block):

@@ -8,6 +8,7 @@ from dcvrt.errors import InputError, did_you_mean
 from dcvrt.models.block import Block
 from dcvrt.models.declared import Algebraic, Declared, Input, Output, Parameter, State
 from dcvrt.models.diagram import Diagram
+from dcvrt.models.evaluation import on_symbols
 from dcvrt.models.expressions import text_of
 from dcvrt.models.netlist import Netlist, netlist
 from dcvrt.models.prose import Heading, Items, Node, Table, Text, parse
@@ -141,6 +142,6 @@ def _modes(path: str, block: Block) -> list[Node]:
     short = shortener(path)
     rows = tuple(
         (row.source, row.target, short(str(row.when)), short(text_of(row.held)))
-        for row in block.transitions(block.symbols(path))
+        for row in on_symbols(block, "transitions", block.symbols(path))
     )
     return [Table(("mode", *block.flags), flags), Table(("from", "to", "when", "held (s)"), rows)]

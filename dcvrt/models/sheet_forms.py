@@ -132,8 +132,14 @@ def _spans(
 # ---- terminal ---------------------------------------------------------------------------------------------
 
 
-def terminal(nodes: list[Node]) -> list[RenderableType]:
-    """What rich prints: tables with borders, formulas as a line of text."""
+NARROW = 100
+"""Columns of a terminal below which the source of a parameter stands under its meaning, not beside it."""
+
+
+def terminal(nodes: list[Node], width: int) -> list[RenderableType]:
+    """What rich prints on a terminal of this width: tables with borders, formulas as a line of text."""
+    from rich import box
+    from rich.console import Group
     from rich.markup import escape
     from rich.padding import Padding
     from rich.table import Table as Grid
@@ -144,7 +150,7 @@ def terminal(nodes: list[Node]) -> list[RenderableType]:
             _spans(
                 text,
                 plain=escape,
-                code=lambda s: f"[cyan]{escape(s)}[/]",
+                code=lambda s: f"[cyan]{escape(s.replace('*', ' * '))}[/]",  # a line may break there
                 bold=lambda s: f"[bold]{escape(s)}[/]",
                 math=lambda s: f"[green]{escape(readable(s))}[/]",
             )
@@ -166,13 +172,16 @@ def terminal(nodes: list[Node]) -> list[RenderableType]:
         elif isinstance(node, Text):
             out.append(styled(node.text))
         else:
-            from rich import box
-
-            grid = Grid(box=box.SIMPLE_HEAD, padding=(0, 1), show_edge=False)
-            for k, head in enumerate(node.head):
-                narrow = max(len(row[k]) for row in node.rows) <= 12
+            together = width < NARROW and node.head[-2:] == ("meaning", "source")
+            grid = Grid(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+            for k, head in enumerate(node.head[:-1] if together else node.head):
+                narrow = max(len(head), *(len(row[k]) for row in node.rows)) <= 14
                 grid.add_column(head, no_wrap=narrow, overflow="fold")
             for row in node.rows:
-                grid.add_row(*map(styled, row))
+                cells: list[RenderableType] = [styled(cell) for cell in row]
+                if together:  # of a bound parameter the value tells what it is bound to
+                    source = [Styled(row[-1], style="dim")] if row[-1] != "bound" else []
+                    cells[-2:] = [Group(cells[-2], *source)]
+                grid.add_row(*cells)
             out += [grid, ""]
     return out

@@ -9,7 +9,7 @@ from dcvrt.models.automaton import Go, above, always, below, outside, within
 from dcvrt.models.block import Block, Equations, Input, Output, Parameter
 from dcvrt.models.command import given, withdrawn
 
-ILLUSTRATIVE = "illustrative: the figure of the regions prints no thresholds"
+ILLUSTRATIVE = "illustrative: the paper prints none"
 
 
 class Supervisor(Block):

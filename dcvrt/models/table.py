@@ -12,7 +12,8 @@ import numpy as np
 from dcvrt.dae import Automaton, Gap, Transition
 from dcvrt.errors import ModelError, did_you_mean, raise_all
 from dcvrt.models.automaton import check_table, gaps
-from dcvrt.models.block import State
+from dcvrt.models.declared import State
+from dcvrt.models.evaluation import NO_NUMBER, holds_nan
 
 if TYPE_CHECKING:
     from dcvrt.models.compile import Flattener
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 def build_automaton(flat: Flattener, name: str, p: ca.SX) -> Automaton:
     """The automaton of one block."""
     block, s = flat.net.blocks[name], flat.s[name]
-    rows = block.transitions(s)
+    rows = flat.rows[name]
     who = f"{flat.net.name}: {name} ({block.label})"
     short = shortener(name)
     problems = check_table(block.modes, block.start, rows)
@@ -30,6 +31,9 @@ def build_automaton(flat: Flattener, name: str, p: ca.SX) -> Automaton:
     states = [key for key in block.declared(State) if key not in block.lagless()]
     for row in rows:
         step = f"{row.source} -> {row.target}"
+        for value in (row.when.margin, row.held, *row.reset.values()):
+            if holds_nan(value):
+                problems.append(f"{step}: {short(str(value))} {NO_NUMBER}")
         if varies(flat.tie(row.held), p):
             problems.append(f"{step}: held may depend on parameters only, not {short(str(row.held))}.")
         problems += [

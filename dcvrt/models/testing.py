@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dcvrt.models.block import Block, Equations, check_equations, stack
+from dcvrt.models.block import Block, Equations
 from dcvrt.models.declared import Algebraic, Declared, Input, Parameter, State
+from dcvrt.models.evaluation import check_equations, on_symbols, scalars, stack
 from dcvrt.models.phasor import Phasor
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ def assert_consistent(
     >>> assert_consistent(Pll())
     """
     s = block.symbols(block.label)
-    equations = block.equations(s)
+    equations = on_symbols(block, "equations", s)
     problems = check_equations(block.label, block, equations)
     assert not problems, "\n".join(problems)
     names = _variables(block)
@@ -53,13 +54,13 @@ def assert_consistent(
     rng = np.random.default_rng(seed)
     for _ in range(points):
         at = _point(block, names, rng, ranges or {})
-        on_symbols, derivatives = (
+        by_symbols, derivatives = (
             np.array(r) for r in function(at, [block.values[n] for n in block.declared(Parameter)])
         )
         on_numbers = _numbers(block, names, at)
         parts = _parts(block, names)
         where = ", ".join(f"{part} = {value:.6g}" for part, value in zip(parts, at, strict=True))
-        for label, number, symbol in zip(labels, on_numbers, on_symbols[:, 0], strict=True):
+        for label, number, symbol in zip(labels, on_numbers, by_symbols[:, 0], strict=True):
             assert isfinite(number), f"{block.label}: {label} is {number} at {where}."
             assert abs(number - symbol) <= 1e-12 * (1 + abs(number)), (
                 f"{block.label}: {label} is {number} on numbers and {symbol} on symbols, at {where}."
@@ -125,7 +126,7 @@ def _numbers(block: Block, names: list[str], at: Array) -> Array:
     results = block.equations(block.at(**given))
     flat: list[float] = []
     for value in (*results.der.values(), *results.out.values(), *results.alg.values()):
-        flat += [float(value.re), float(value.im)] if isinstance(value, Phasor) else [float(value)]
+        flat += map(float, scalars(value))
     return np.array(flat)
 
 

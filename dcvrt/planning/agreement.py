@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import SimulationError
+from dcvrt.grid.powerflow import HourlySolution
 from dcvrt.planning.master import Cut, Master, Solution
 from dcvrt.planning.plan import VoltageInfo
 from dcvrt.planning.voltage_screen import Tangent, VoltageScreen
@@ -13,14 +16,21 @@ from dcvrt.planning.voltage_screen import Tangent, VoltageScreen
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-GUARD = 5e-4
-"""Hours with a linear voltage closer to a limit than this are solved by AC power flow, pu."""
+GUARD = 2e-5
+"""Hours whose expected voltage is closer to a limit than this are solved by AC power flow, pu."""
 WIDENING = 2.5
-"""The band of a bus is at least this times the largest error found at the bus."""
+"""The band is at least this times the largest error of the expectation found near a limit."""
+NEAR = 5e-4
+"""Distance to a limit within which screen and AC power flow must agree, pu."""
 AGREED_EVERYWHERE = 1e-4
-"""Difference of screen and AC power flow that is let pass within the guard bands where no limit binds, pu."""
+"""Difference of screen and AC power flow that is let pass near limits where none binds, pu."""
 AGREED_AT_LIMITS = 1e-7
 """The same where a limit binds, and the AC violation that is let pass, pu."""
+VALIDATED = 20
+"""Hours that are solved to measure the error of the expectation where none is near a limit."""
+MARGIN = 0.01
+"""Buses that the screen keeps farther from their limits than this in every hour are left out, pu, unless the
+screen proves wrong by half of it somewhere."""
 STEEP = 3e-4
 """Hours closer to a limit than this get new slopes, pu."""
 PASSES = 40
@@ -29,95 +39,224 @@ PASSES = 40
 class Agreement:
     """Moves the screen to the optimum, pass by pass, until AC power flow says the same.
 
-    Only hours near a limit are solved. The guard band of a bus is at least `WIDENING` times the largest error
-    found there, so an hour left out would need an error that much larger to reach a limit; `check_ac`
-    solves all. Tangents from earlier passes stay as cuts while they exclude nothing that AC power flow
-    allows (`Tangent.bounds`); with voltages concave in H that is always so, and the passes converge also
-    where fewer limits bind than there are sites.
+    Few hours are solved: a sample tells how voltages fall with the parameters of an hour (`VoltageDrop`), and
+    hours that are expected near a limit are solved, with a guard band that the errors of the expectation
+    justify; each error is that of an hour before it was solved. `check_ac` solves all hours. Tangents from
+    earlier passes stay as cuts while they exclude nothing that AC power flow allows (`Tangent.bounds`); with
+    voltages concave in H that is always so, and the passes converge also where fewer limits bind than there
+    are sites.
     """
 
     def __init__(self, screen: VoltageScreen, repeat: bool) -> None:
         self.screen, self.repeat = screen, repeat
         self.passes, self.checked = 0, 0
-        self.guard = np.full(len(screen.pq), GUARD)
+        self.guard = GUARD
         self.error, self.lowest, self.highest = 0.0, np.nan, np.nan
+        self.least_room = np.zeros(0)
 
     def reached(self, solution: Solution, master: Master) -> bool:
         """Compare at the optimum; if they differ, linearise again and renew the cuts of `master`."""
-        screen, H = self.screen, solution.H
-        hours, v = self._solve_near_limits(H)
+        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        if self.repeat and tangents:
+            first = self._glance(solution.H, tangents)
+            if self._overstates(first) > AGREED_AT_LIMITS:
+                return self._move(solution.H, first, master)
+        look = self._look(solution.H, tangents)
+        self.checked = len(look.hours)
+        size = self.screen.sizes(look.solved)
+        self.lowest, self.highest = float(size.min()), float(size.max())
         if not self.repeat:
             return True
-        size = abs(v[screen.pq])
-        room = np.minimum(size - screen.lower[:, hours], screen.upper[:, hours] - size)
-        place = {int(hour): k for k, hour in enumerate(hours)}
-        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
-        tight = [t for t in tangents if t.side * (t.limit - t.constant - t.slope @ H) < AGREED_AT_LIMITS]
-        at_limits = max(
-            (abs(t.constant + t.slope @ H - size[t.bus, place[t.hour]]) for t in tight), default=0.0
-        )
-        if max(-room.min(), at_limits) <= AGREED_AT_LIMITS and self.error <= AGREED_EVERYWHERE:
+        apart = self._differs(solution.H, look, tangents)
+        if apart <= AGREED_AT_LIMITS and self.error <= AGREED_EVERYWHERE:
             return True
+        return self._move(solution.H, look, master)
+
+    def _overstates(self, look: _Look) -> float:
+        """Largest AC violation of a limit, pu."""
+        size = self.screen.sizes(look.solved)
+        return -float(self.screen.room(size, np.arange(len(size)), look.hours).min())
+
+    def _differs(self, H: Floats, look: _Look, tangents: list[Tangent]) -> float:
+        """Largest AC violation, and largest error of a tangent that is met without room, pu."""
+        size = self.screen.sizes(look.solved)
+        place = {int(hour): k for k, hour in enumerate(look.hours)}
+        tight = _tight(tangents, H)
+        apart = [abs(t.constant + t.slope @ H - size[t.bus, place[t.hour]]) for t in tight]
+        return max([self._overstates(look), *apart])
+
+    def _move(self, H: Floats, look: _Look, master: Master) -> bool:
+        """Linearise again at `H` and renew the cuts of `master`."""
+        screen, hours = self.screen, look.hours
+        size = screen.sizes(look.solved)
+        room = screen.room(size, np.arange(len(size)), hours)
         self.passes += 1
         if self.passes > PASSES:
             bus, k = np.unravel_index(room.argmin(), room.shape)
             raise SimulationError(
-                "Voltage screen and AC power flow still differ by "
-                f"{max(-room.min(), at_limits):.2g} pu after {PASSES} linearisations, most at bus "
-                f"{screen.network.bus[screen.pq[bus]]} in hour {screen.year.hours[hours[k]]}. "
+                f"Voltage screen and AC power flow still differ after {PASSES} linearisations; the voltage "
+                "nearest to its limit, or farthest beyond, is at bus "
+                f"{screen.network.bus[screen.moving[bus]]} in hour {screen.year.hours[hours[k]]}. "
                 "Ways out: a smaller h_max, or voltage_screen='one-shot' with check_ac."
             )
-        screen.relinearise(H, hours, v, np.flatnonzero(room.min(axis=0) < STEEP))
-        kept = [
-            cut
-            for cut in master.cuts
-            if not isinstance(cut.origin, Tangent)
-            or cut.origin.hour not in place
-            or cut.origin.bounds(H, size[cut.origin.bus, place[cut.origin.hour]])
-        ]
-        moved = dict.fromkeys(t.key for t in tangents if t.hour in place)
-        renewed = [screen.tangent(*key) for key in moved]
-        master.cuts = kept + [Cut(*t.cut(), origin=t) for t in renewed]
+        steep = np.flatnonzero(room.min(axis=0) < STEEP)
+        screen.relinearise(H, hours, look.solved, steep, look.rows, look.expected)
+        place = {int(hour): k for k, hour in enumerate(hours)}
+
+        def stays(cut: Cut) -> bool:
+            t = cut.origin
+            if not isinstance(t, Tangent):
+                return True
+            if t.hour not in place:
+                return look.expected is None
+            return t.bounds(H, size[t.bus, place[t.hour]])
+
+        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        moved = [t.key for t in tangents if t.hour in place or look.expected is not None]
+        renewed = [screen.tangent(*key) for key in dict.fromkeys(moved)]
+        master.cuts = [cut for cut in master.cuts if stays(cut)]
+        master.cuts += [Cut(*t.cut(), origin=t) for t in renewed]
         return False
 
-    def _solve_near_limits(self, H: Floats) -> tuple[Integers, npt.NDArray[np.complex128]]:
-        """AC voltages of every hour near a limit, with guard bands that the errors found justify."""
-        screen = self.screen
-        linear = screen.voltages(H)
-        room = np.minimum(linear - screen.lower, screen.upper - linear)
-        hours = np.unique(room.argmin(axis=1))  # the worst hour of each bus, to see what errors there are
-        v = np.zeros((len(screen.network.bus), 0), dtype=complex)
-        solved = np.zeros(0, dtype=np.int64)
-        error = np.zeros(len(screen.pq))
-        while len(hours):
-            fresh = screen.ac.solve(H, hours).require().v
-            error = np.maximum(error, abs(abs(fresh[screen.pq]) - linear[:, hours]).max(axis=1))
-            solved, v = np.r_[solved, hours], np.hstack([v, fresh])
-            self.guard = np.maximum(GUARD, WIDENING * error)
-            if not self.repeat:
-                break  # a sample is enough to tell how wrong it is
-            near: npt.NDArray[np.bool_] = np.any(room < self.guard[:, None], axis=0)
-            near[solved] = False
-            hours = np.flatnonzero(near)
-        size = abs(v[screen.pq])
-        self.checked = len(solved)
-        close = room[:, solved] < self.guard[:, None]
-        self.error = float(abs(size - linear[:, solved])[close].max(initial=0.0))
-        self.lowest, self.highest = float(size.min()), float(size.max())
-        return solved, v
+    def restart(self, H: Floats, master: Master) -> bool:
+        """Move the screen to the smallest sizes of open sites, where the master found no plan; whether there
+        all limits hold.
 
-    def info(self, H: Floats) -> VoltageInfo:
+        A linearisation made elsewhere can understate voltages where a unit leaves its reactive limit.
+        """
+        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        look = self._look(H, tangents)
+        self._move(H, look, master)
+        return self._overstates(look) <= AGREED_AT_LIMITS
+
+    def _glance(self, H: Floats, tangents: list[Tangent]) -> _Look:
+        """Solve only the hours in which a tangent is met without room and the worst hour of each bus near a
+        limit: enough to see most limits that the screen lets be broken."""
+        screen = self.screen
+        rows = screen.near(H, 0.0)
+        worst = screen.room(screen.voltages(H, rows), rows).argmin(axis=1)
+        hours = np.unique(np.r_[worst, [t.hour for t in _tight(tangents, H)]].astype(np.int64))
+        if not len(hours):
+            hours = np.array([tangents[0].hour])
+        return _Look(rows, hours, screen.ac.solve(H, hours).require(), None)
+
+    def _look(self, H: Floats, tangents: list[Tangent]) -> _Look:
+        """Solve the hours that matter at `H`, and say what to expect in the others."""
+        screen = self.screen
+        rows = screen.near(H, MARGIN)
+        linear = screen.voltages(H, rows)
+        room = screen.room(linear, rows)
+        self.least_room = np.minimum(room.min(axis=0, initial=MARGIN), MARGIN)
+        worst = room.argmin(axis=1)
+        if not self.repeat:  # a sample is enough to tell how wrong the screen is
+            hours = np.array([int(self.least_room.argmin())])
+            solved = screen.ac.solve(H, hours).require()
+            size = screen.sizes(solved)[rows]
+            self.error = _error(screen, rows, hours, size, linear[:, hours])
+            return _Look(rows, hours, solved, linear)
+        tight = [t.hour for t in _tight(tangents, H)]
+        fresh = np.unique(np.r_[screen.interpolation.sample, worst, np.array(tight, dtype=np.int64)])
+        hours = np.zeros(0, dtype=np.int64)
+        found: list[HourlySolution] = []
+        size, missed, expected = np.zeros((len(rows), 0)), 0.0, linear
+        while len(fresh):
+            solved = screen.ac.solve(H, fresh).require()
+            now = screen.sizes(solved)
+            if found:  # what was expected before these hours were solved
+                missed = max(missed, _missed(screen, rows, fresh, now[rows], expected))
+            else:
+                off = abs(now - screen.constant[:, fresh] - screen.slope[:, fresh] @ H).max()
+                if 2 * off > MARGIN and len(rows) < len(now):
+                    rows = np.arange(len(now))  # the screen is too wrong to leave any bus out
+                    linear, size = screen.voltages(H), np.zeros((len(rows), 0))
+            found.append(solved)
+            hours, size = np.r_[hours, fresh], np.hstack([size, now[rows]])
+            base = screen.unhosted[rows]
+            if len(hours) < len(screen.year):
+                expected = base - screen.interpolation.expect(base[:, hours] - size, hours)
+            else:
+                expected = linear.copy()
+            missed = max(missed, _missed(screen, rows, hours, size, expected))
+            expected[:, hours] = size
+            self.guard = max(GUARD, WIDENING * missed)
+            trusted = len(found) == 1 and self.guard <= AGREED_EVERYWHERE
+            if (
+                trusted
+                and self._differs(H, _Look(rows, hours, solved, expected), tangents) > AGREED_AT_LIMITS
+            ):
+                break  # the optimum will move, and what is expected is good enough to move it
+            room = screen.room(expected, rows).min(axis=0, initial=np.inf)
+            room[hours] = np.inf
+            fresh = np.flatnonzero(room < self.guard)
+            if not len(fresh) and len(found) == 1:  # an error must have been measured
+                fresh = np.argsort(room, kind="stable")[:VALIDATED]
+                fresh = np.sort(fresh[np.isfinite(room[fresh])])
+        self.error = _error(screen, rows, slice(None), expected, linear)
+        return _Look(rows, hours, _joined(found), expected)
+
+    def info(self) -> VoltageInfo:
         """What to tell about the last comparison."""
-        linear = self.screen.voltages(H)
-        room = np.minimum(linear - self.screen.lower, self.screen.upper - linear).min(axis=0)
         return VoltageInfo(
             "relinearised" if self.repeat else "one-shot",
             self.passes,
-            float(self.guard.max()),
+            self.guard,
             self.checked,
             self.error,
             self.lowest,
             self.highest,
             self.screen.widened,
-            room,
+            self.least_room,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What AC power flow says at some capacities.
+
+    Attributes
+    ----------
+    rows : int array (rows,)
+        Moving buses that may be near a limit in some hour.
+    hours : int array (hours,)
+        Positions of the hours that were solved.
+    solved : HourlySolution
+        Of these hours.
+    expected : array (rows, all hours) or None
+        Voltages, pu: solved where they were, else interpolated; None where only some hours were asked for.
+    """
+
+    rows: Integers
+    hours: Integers
+    solved: HourlySolution
+    expected: Floats | None
+
+
+def _tight(tangents: list[Tangent], H: Floats) -> list[Tangent]:
+    """Tangents that are met without room at `H`."""
+    return [t for t in tangents if t.side * (t.limit - t.constant - t.slope @ H) < AGREED_AT_LIMITS]
+
+
+def _missed(screen: VoltageScreen, rows: Integers, hours: Integers, true: Floats, expected: Floats) -> float:
+    """Largest error of the expectation among voltages near a limit in some hours."""
+    close = screen.room(true, rows, hours) < NEAR
+    return float(abs(true - expected[:, hours])[close].max(initial=0.0))
+
+
+def _error(
+    screen: VoltageScreen, rows: Integers, hours: Integers | slice, true: Floats, linear: Floats
+) -> float:
+    """Largest difference where either voltage is near a limit."""
+    room = np.minimum(screen.room(true, rows, hours), screen.room(linear, rows, hours))
+    return float(abs(true - linear)[room < NEAR].max(initial=0.0))
+
+
+def _joined(found: list[HourlySolution]) -> HourlySolution:
+    """Solutions of different hours as one."""
+    return HourlySolution(
+        np.hstack([s.v for s in found]),
+        np.concatenate([s.converged for s in found]),
+        np.concatenate([s.mismatch_mva for s in found]),
+        np.concatenate([s.worst_bus for s in found]),
+        np.concatenate([s.hours for s in found]),
+        np.hstack([s.limited for s in found]),
+    )

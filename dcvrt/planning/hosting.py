@@ -10,15 +10,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.errors import InfeasibleError, did_you_mean, raise_all
+from dcvrt.errors import InfeasibleError, InputError, did_you_mean, raise_all
 from dcvrt.grid.network import Network
 from dcvrt.planning import monolith, report
 from dcvrt.planning.agreement import Agreement
 from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import FlowCut
-from dcvrt.planning.master import Cut, Master, Solution
+from dcvrt.planning.master import Cut, Master, Question, Solution
+from dcvrt.planning.objective import MaxMin, MaxTotal, Objective, Rating
 from dcvrt.planning.plan import AcVerdict, Certificate, Plan, Row, VoltageInfo
 from dcvrt.planning.profiles import Year
+from dcvrt.planning.security import N1
 from dcvrt.planning.voltage_screen import HostedFlow, Tangent, VoltageScreen
 
 Floats = npt.NDArray[np.float64]
@@ -57,7 +59,7 @@ class HostingProblem:
     rating_scale : float
         Factor on every branch rating.
     voltage : (float, float) or None
-        Limits at every `pq` bus in every hour, pu; None leaves voltages out.
+        Limits in every hour at every bus whose voltage can move, pu; None leaves voltages out.
     pf : float
         Power factor of the hosted load, lagging.
     h_max, min_size : float or mapping of bus number to float
@@ -68,6 +70,12 @@ class HostingProblem:
     base_violations : str
         What to do with voltages outside the limits before anything is hosted. `error`: raise. `hold`: they
         must only not get worse; `plan.voltage.widened` counts them.
+    security : N1, optional
+        Outages that every hour must survive without redispatch. `plan.security` says what is covered.
+    reactive_limits : bool
+        Whether the AC power flow keeps units within their reactive limits, by switching buses between
+        holding their voltage and giving what they can. Without, voltages at generator buses are held
+        whatever that takes, and `check_ac` says how far beyond their limits units are.
     hull : bool
         Look at the corner hours of the convex hull of the operating parameters only, which is exact and
         quicker.
@@ -91,6 +99,8 @@ class HostingProblem:
         *,
         voltage_screen: str = "relinearised",
         base_violations: str = "error",
+        security: N1 | None = None,
+        reactive_limits: bool = True,
         hull: bool = True,
     ) -> None:
         sites = tuple(sites)
@@ -99,6 +109,8 @@ class HostingProblem:
         )
         upper = _per_site("h_max", h_max, sites, problems)
         lower = _per_site("min_size", min_size, sites, problems)
+        problems += [] if security is None else security.faults(network)
+        problems += _unit_faults(network, hours)
         problems += [
             f"min_size {low:g} MW at site {bus} exceeds its h_max {high:g} MW."
             for bus, low, high in zip(sites, lower, upper, strict=True)
@@ -110,6 +122,7 @@ class HostingProblem:
         self.sites, self.year, self.rating_scale = sites, hours, rating_scale
         self.voltage, self.pf, self.voltage_screen = voltage, pf, voltage_screen
         self.lower, self.upper = lower, upper
+        self.security, self.reactive_limits = security, reactive_limits
         self._base_violations, self._hull = base_violations, hull
         self._flow_cuts: list[FlowCut] = []
         self._voltage_keys: dict[tuple[int, int, int], None] = {}
@@ -119,7 +132,7 @@ class HostingProblem:
     @cached_property
     def certifier(self) -> Hours:
         """The hours as dispatch problems; raises `InfeasibleError` when the base case has no dispatch."""
-        hours = Hours(self.network, self.network.indices(self.sites), self.year, self._hull)
+        hours = Hours(self.network, self.network.indices(self.sites), self.year, self._hull, self.security)
         if hours.certify(np.zeros(len(self.sites))) is not None:
             raise InfeasibleError(report.base_case(hours, self.rating_scale))
         return hours
@@ -127,7 +140,7 @@ class HostingProblem:
     @cached_property
     def ac(self) -> HostedFlow:
         """AC power flow of the hours at any capacities."""
-        return HostedFlow(self.network, self.sites, self.year, self.pf)
+        return HostedFlow(self.network, self.sites, self.year, self.pf, self.reactive_limits)
 
     @cached_property
     def screen(self) -> VoltageScreen | None:
@@ -139,18 +152,30 @@ class HostingProblem:
     # -- solving -------------------------------------------------------------------------------------------
 
     def solve(
-        self, rows: Iterable[Row] = (), bounds: Mapping[int, tuple[float, float]] | None = None
+        self,
+        rows: Iterable[Row] = (),
+        bounds: Mapping[int, tuple[float, float]] | None = None,
+        objective: Objective | None = None,
+        rating: Rating | None = None,
+        must_open: Sequence[int] = (),
     ) -> Plan:
-        """Find the largest plan.
+        """Find the best plan. Cuts are kept, so that asking again is quick.
 
         Parameters
         ----------
         rows : iterable of Row
-            Further requirements, for instance ride-through margins. A row that belongs to a site holds only
-            while the site is open: where it cannot be met, the site is closed and `plan.closed` says so.
+            Further requirements, for instance ride-through margins or the aggregate loss of a fault. A row
+            that belongs to a site holds only while the site is open: where it cannot be met, the site is
+            closed and `plan.closed` says so.
         bounds : mapping of bus number to (low, high), optional
-            Range in which an open site must lie, MW, for instance the sampled domain of a surrogate; it
-            narrows `min_size` and `h_max`.
+            Range in which an open site must lie, MW, for instance the sampled domain of a surrogate or a
+            trust region; it narrows `min_size` and `h_max`.
+        objective : MaxTotal or MaxMin, optional
+            Default the plain total.
+        rating : Rating, optional
+            Makes the converter ratings unknowns that rows may contain.
+        must_open : sequence of int
+            Sites that may not be closed: their smallest sizes and their rows hold whatever it costs.
 
         Returns
         -------
@@ -159,16 +184,83 @@ class HostingProblem:
         Raises
         ------
         InputError
-            When a row or a bound names no site or is not finite.
+            When something names no site or is not finite.
         InfeasibleError
-            When the base case breaks a limit, or rows that belong to no site exclude every plan.
+            When the base case breaks a limit, rows that belong to no site exclude every plan, or the smallest
+            sizes of sites that must be open exceed the limits.
         SimulationError
             When voltages do not settle, which happens close to the limit of power transfer.
         """
+        question = self._question(rows, bounds or {}, objective, rating, must_open)
+        return self._answer(question)
+
+    def pareto(
+        self,
+        points: int = 5,
+        rows: Iterable[Row] = (),
+        bounds: Mapping[int, tuple[float, float]] | None = None,
+        shares: Mapping[int, float] | None = None,
+    ) -> list[Plan]:
+        """Plans between the largest total and the largest least size, each with the largest total at its
+        least size.
+
+        Parameters
+        ----------
+        points : int
+            Number of plans, at least 2.
+        rows, bounds : as in `solve`.
+        shares : as in `MaxMin`.
+
+        Returns
+        -------
+        list of Plan
+            Least sizes rise and totals fall from plan to plan.
+        """
+        if points < 2:
+            raise InputError(f"pareto: {points} points; a front has at least 2.")
+        rows, fair = tuple(rows), MaxMin(shares or {})
+        question = self._question(rows, bounds or {}, fair, None, ())
+        last = self._answer(question)
+        first = self._answer(replace(question, objective=MaxTotal()))
+        share = question.shares
+        size = np.array([first.by_site[bus] for bus in self.sites])
+        start = float((size[share > 0] / share[share > 0]).min(initial=np.inf))
+        between = np.linspace(start, last.objective, points)[1:-1]
+        return [first, *(self._answer(question.with_floor(mu)) for mu in between), last]
+
+    def _question(
+        self,
+        rows: Iterable[Row],
+        bounds: Mapping[int, tuple[float, float]],
+        objective: Objective | None,
+        rating: Rating | None,
+        must_open: Sequence[int],
+    ) -> Question:
+        """Check what is asked."""
         rows = tuple(rows)
-        lower, upper = self._box(bounds or {})
-        raise_all(_row_faults(rows, self.sites), "requirement rows")
-        master = Master(self.sites, lower, upper, rows)
+        objective = MaxTotal() if objective is None else objective
+        lower, upper = self._box(bounds)
+        raise_all(_row_faults(rows, self.sites, rating), "requirement rows")
+        problems = objective.faults(self.sites) + ([] if rating is None else rating.faults())
+        problems += [
+            f"must_open names {bus!r}, which is not a site.{did_you_mean(bus, self.sites)}"
+            for bus in must_open
+            if bus not in self.sites
+        ]
+        raise_all(problems, "objective")
+        forced = np.array([bus in set(must_open) for bus in self.sites])
+        return Question(self.sites, lower, upper, rows, objective, rating, forced)
+
+    def _answer(self, question: Question) -> Plan:
+        """Solve; for `MaxMin` the total is maximised once the least size is known."""
+        found = self._optimum(question)
+        if not isinstance(question.objective, MaxMin):
+            return found
+        kept = self._optimum(question.with_floor(found.objective))
+        return replace(kept, objective=found.objective)
+
+    def _optimum(self, question: Question) -> Plan:
+        master = question.master()
         hours, screen = self.certifier, self.screen
         master.cuts = [self._as_cut(cut) for cut in self._flow_cuts]
         if screen is not None:
@@ -180,30 +272,54 @@ class HostingProblem:
             chosen = master.choose() if master.may_close else _all_open(len(self.sites))
             if chosen is None:
                 break
-            more = np.inf if best is None else chosen.total - best[0].total
+            more = np.inf if best is None else chosen.objective - best[0].objective
             if more <= TOTAL_TOLERANCE or tuple(chosen.open) in tried:
-                gap = 0.0 if best is None else max(0.0, more) / max(best[0].total, 1.0)
+                gap = 0.0 if best is None else max(0.0, more) / max(best[0].objective, 1.0)
                 break
             tried.add(tuple(chosen.open))
-            floor = -np.inf if best is None else best[0].total + TOTAL_TOLERANCE
+            floor = -np.inf if best is None else best[0].objective + TOTAL_TOLERANCE
             agreement = None if screen is None else Agreement(screen, self.voltage_screen == "relinearised")
             settled = self._settle(master, chosen.open, floor, agreement)
             if settled is not None:
-                best = settled, hours.certificate, None if agreement is None else agreement.info(settled.H)
+                best = settled, hours.certificate, None if agreement is None else agreement.info()
             if not master.may_close:
                 break
         if best is None:
-            raise InfeasibleError(report.no_plan(rows))
+            raise InfeasibleError(self._why_none(question, master))
         solution, certificate, voltage = best
         return report.plan(self, master, solution, certificate, voltage, gap)
+
+    def _why_none(self, question: Question, master: Master) -> str:
+        """Say why no plan exists: smallest sizes, or the requirement rows."""
+        forced = question.must_open & (question.lower > 0)
+        if forced.any():
+            sizes = {
+                bus: float(mw) for bus, mw, f in zip(self.sites, question.lower, forced, strict=True) if f
+            }
+            free = replace(
+                question,
+                lower=np.where(forced, 0.0, question.lower),
+                objective=MaxMin({bus: sizes.get(bus, 0.0) for bus in self.sites}),
+            )
+            try:
+                share = self._optimum(free).objective
+            except InfeasibleError:
+                return report.no_plan(master)
+            return report.sizes_too_large(sizes, share)
+        return report.no_plan(master)
 
     def _settle(
         self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None
     ) -> Solution | None:
-        """Optimum for given open sites, all hours certified; None when there is none above `floor` MW."""
+        """Optimum for given open sites, all hours certified; None when there is none above `floor`."""
+        restarted = False
         while True:
             solution = master.solve(is_open)
-            if solution is None or solution.total <= floor:
+            if solution is None and agreement is not None and not restarted:
+                restarted = True
+                if agreement.restart(np.where(is_open, master.lower, 0.0), master):
+                    continue
+            if solution is None or solution.objective <= floor:
                 return None
             if agreement is not None:
                 violated = agreement.screen.violated(solution.H, VOLTAGE_ROW_TOLERANCE)
@@ -272,6 +388,11 @@ class HostingProblem:
         hours: Iterable[int] | None = None,
         rows: Sequence[Row] = (),
         around: Plan | None = None,
+        *,
+        bounds: Mapping[int, tuple[float, float]] | None = None,
+        objective: Objective | None = None,
+        rating: Rating | None = None,
+        must_open: Sequence[int] = (),
     ) -> None:
         """Write the problem whole, angles and all rows, for any solver to check.
 
@@ -281,21 +402,22 @@ class HostingProblem:
             File to write (.mps).
         hours : iterable of int, optional
             Hours of the year; default all. A week is about 70 000 rows.
-        rows : sequence of Row
+        rows, bounds, objective, rating, must_open
             As in `solve`.
         around : Plan, optional
             Point at which the voltage rows are linearised; default nothing hosted.
         """
-        raise_all(_row_faults(tuple(rows), self.sites), "requirement rows")
+        question = self._question(rows, bounds or {}, objective, rating, must_open)
         at = np.arange(len(self.year)) if hours is None else self.year.positions(hours)
         point = np.zeros(len(self.sites)) if around is None else self._vector(around)
-        monolith.build(self, at, tuple(rows), point).write(path)
+        monolith.build(self, at, question.master(), point).write(path)
 
 
 def _all_open(count: int) -> Solution:
     """The choice when no site can profit from being closed."""
     nothing = np.zeros(0)
-    return Solution(np.zeros(count), np.ones(count, dtype=bool), np.inf, nothing, nothing, nothing)
+    every = np.ones(count, dtype=bool)
+    return Solution(np.zeros(count), nothing, every, np.inf, (), nothing, nothing, nothing, nothing)
 
 
 def _tangent_cut(tangent: Tangent) -> Cut:
@@ -366,15 +488,43 @@ def _per_site(
     return sizes
 
 
-def _row_faults(rows: tuple[Row, ...], sites: tuple[int, ...]) -> list[str]:
+def _unit_faults(network: Network, hours: Year) -> list[str]:
+    """Units with limits of their own in some hours that are unknown, or whose limits cross."""
+    units = network.generators
+    place = {name: k for k, name in enumerate(units.name)}
+    problems = []
+    for name in {**hours.p_min, **hours.p_max}:
+        if name not in place:
+            problems.append(f"unit {name!r} is not in {network.name}.{did_you_mean(name, units.name)}")
+            continue
+        low = hours.p_min.get(name, np.full(len(hours), units.p_min[place[name]]))
+        high = hours.p_max.get(name, np.full(len(hours), units.p_max[place[name]]))
+        crossed = np.flatnonzero(low > high)
+        if len(crossed):
+            k = crossed[0]
+            problems.append(
+                f"unit {name} has p_min {low[k]:g} MW above p_max {high[k]:g} MW in hour {hours.hours[k]}"
+                + (f" ({len(crossed)} hours in all)." if len(crossed) > 1 else ".")
+            )
+    return problems
+
+
+def _row_faults(rows: tuple[Row, ...], sites: tuple[int, ...], rating: Rating | None) -> list[str]:
     problems = []
     for row in rows:
-        named = [*row.coefficients, *([] if row.site is None else [row.site])]
+        named = [*row.coefficients, *row.rating, *([] if row.site is None else [row.site])]
         problems += [
             f"row {row.label!r} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
             for bus in dict.fromkeys(named)
             if bus not in sites
         ]
-        if not np.isfinite([row.lower, *row.coefficients.values()]).all():
+        values = [*row.coefficients.values(), *row.rating.values()]
+        limits = [limit for limit in (row.lower, row.upper) if np.isnan(limit) or np.isfinite(limit)]
+        if not limits or not np.isfinite([*limits, *values]).all() or row.lower > row.upper:
             problems.append(f"row {row.label!r} has a coefficient or a limit that is not finite.")
+        if row.rating and rating is None:
+            problems.append(
+                f"row {row.label!r} contains converter ratings, but none are asked for. "
+                "Way out: solve(..., rating=Rating(...))."
+            )
     return problems

@@ -12,7 +12,6 @@ import scipy.sparse as sp
 
 from dcvrt.errors import InputError
 from dcvrt.planning.master import Master, highs, model
-from dcvrt.planning.plan import Row
 
 if TYPE_CHECKING:
     import highspy
@@ -63,8 +62,11 @@ class Monolith:
             raise InputError(f"{path}: cannot be written.")
 
 
-def build(problem: HostingProblem, hours: Integers, requirements: tuple[Row, ...], point: Floats) -> Monolith:
-    """Write out the problem for some hours (positions), its voltage rows linearised at `point`."""
+def build(problem: HostingProblem, hours: Integers, master: Master, point: Floats) -> Monolith:
+    """Write out the problem for some hours (positions), its voltage rows linearised at `point`.
+
+    `master` gives the columns and rows that belong to no hour; its cuts are left out.
+    """
     network, year, sites = problem.network, problem.year, problem.sites
     n_bus, n_line, n_unit, n_hour = (
         len(network.bus),
@@ -72,9 +74,12 @@ def build(problem: HostingProblem, hours: Integers, requirements: tuple[Row, ...
         len(network.generators),
         len(hours),
     )
-    master = Master(sites, problem.lower, problem.upper, requirements)
-    head, names = _head(master)
+    n_choice = len(sites) if master.may_close else 0
+    head = master.with_choice() if n_choice else master.without_choice(np.ones(len(sites), dtype=bool))[0]
+    names = master.names + [f"open_{bus}" for bus in sites[:n_choice]]
     n_head = len(names)
+    smallest = np.zeros(len(sites)) if n_choice else master.lower
+    rest = len(master.names) - len(sites)
 
     # One hour: [balance; flow] in the unknowns [theta; P].
     flow = sp.diags(network.susceptance) @ network.incidence
@@ -89,17 +94,34 @@ def build(problem: HostingProblem, hours: Integers, requirements: tuple[Row, ...
     fixed = problem.certifier.fixed[:, hours] + (network.incidence.T @ own)[:, None]
     rating = np.repeat(network.branches.rating[:, None], n_hour, axis=1)
     blocks = [
-        sp.hstack([head.matrix, sp.csr_matrix((len(head.low), n_hour * (n_bus + n_unit)))]),
+        sp.hstack([sp.csr_matrix(head.matrix), sp.csr_matrix((len(head.low), n_hour * (n_bus + n_unit)))]),
         sp.hstack([sp.kron(year.dc[hours][:, None], site), sp.kron(sp.identity(n_hour), hour)]),
     ]
     low = [head.low, np.vstack([fixed, own[:, None] - rating]).T.ravel()]
     high = [head.high, np.vstack([fixed, own[:, None] + rating]).T.ravel()]
     lines = _unique([network.branches.label(b) for b in range(n_line)])
-    row_names = head.rows + [
+    row_names = head.names + [
         f"{name}_h{t}"
         for t in year.hours[hours]
         for name in [*(f"balance_{b}" for b in network.bus), *(f"flow_{line}" for line in lines)]
     ]
+    outages = problem.certifier.outages
+    if len(outages):
+        blocks.append(
+            sp.hstack(
+                [sp.csr_matrix((n_hour * len(outages) * n_line, n_head)), _after_outages(problem, n_hour)]
+            )
+        )
+        drift = own[:, None] + outages.factors * own[outages.branch]
+        limit = np.repeat(outages.rating[:, None], len(outages), axis=1)
+        low.append(np.tile((drift - limit).ravel(), n_hour))
+        high.append(np.tile((drift + limit).ravel(), n_hour))
+        row_names += [
+            f"flow_{line}_without_{lines[k]}_h{t}"
+            for t in year.hours[hours]
+            for line in lines
+            for k in outages.branch
+        ]
     if problem.screen is not None:
         at_point = _linearised(problem, hours, point)
         blocks.append(
@@ -112,7 +134,9 @@ def build(problem: HostingProblem, hours: Integers, requirements: tuple[Row, ...
         )
         low.append(at_point.low)
         high.append(at_point.high)
-        row_names += [f"V_{bus}_h{t}" for t in year.hours[hours] for bus in network.bus[problem.screen.pq]]
+        row_names += [
+            f"V_{bus}_h{t}" for t in year.hours[hours] for bus in network.bus[problem.screen.moving]
+        ]
     free = np.full(n_bus, np.inf)
     free[network.slack] = 0.0
     units = network.generators
@@ -122,31 +146,28 @@ def build(problem: HostingProblem, hours: Integers, requirements: tuple[Row, ...
         for t in year.hours[hours]
         for name in [*(f"theta_{b}_h{t}" for b in network.bus), *(f"P_{unit}_h{t}" for unit in units.name)]
     ]
+    unit_low, unit_high = problem.certifier.unit_ranges.limits(hours)
     return Monolith(
-        cost=np.r_[head.cost, width],
-        lower=np.r_[head.lower, np.tile(np.r_[-free, units.p_min], n_hour)],
-        upper=np.r_[head.upper, np.tile(np.r_[free, units.p_max], n_hour)],
+        cost=np.r_[master.cost, np.zeros(n_choice), width],
+        lower=np.r_[
+            smallest,
+            np.zeros(rest),
+            master.must_open[:n_choice],
+            np.vstack([np.repeat(-free[:, None], n_hour, axis=1), unit_low]).T.ravel(),
+        ],
+        upper=np.r_[
+            master.upper,
+            np.full(rest, np.inf),
+            np.ones(n_choice),
+            np.vstack([np.repeat(free[:, None], n_hour, axis=1), unit_high]).T.ravel(),
+        ],
         matrix=sp.vstack(blocks, format="csr"),
         row_lower=np.concatenate(low),
         row_upper=np.concatenate(high),
-        whole=np.r_[head.whole, np.zeros(len(width), dtype=bool)],
+        whole=np.r_[np.zeros(len(master.names), bool), np.ones(n_choice, bool), np.zeros(len(width), bool)],
         columns=columns,
         rows=row_names,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Head:
-    """Columns and rows that belong to no hour: capacities, open sites, requirements."""
-
-    cost: Floats
-    lower: Floats
-    upper: Floats
-    whole: npt.NDArray[np.bool_]
-    matrix: sp.csr_matrix
-    low: Floats
-    high: Floats
-    rows: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,42 +177,25 @@ class _VoltageRows:
     high: Floats
 
 
-def _head(master: Master) -> tuple[_Head, list[str]]:
-    n = len(master.sites)
-    names = [f"H_{bus}" for bus in master.sites]
-    requirement = [f"row{r}" for r in range(len(master.rows))]
-    if not master.may_close:
-        return _Head(
-            np.ones(n),
-            master.lower,
-            master.upper,
-            np.zeros(n, bool),
-            sp.csr_matrix(master.coefficients),
-            master.required,
-            np.full(len(requirement), np.inf),
-            requirement,
-        ), names
-    matrix, low, high = master.with_choice()
-    choice = [f"{what}_{bus}" for what in ("largest", "smallest") for bus in master.sites]
-    return _Head(
-        np.r_[np.ones(n), np.zeros(n)],
-        np.zeros(2 * n),
-        np.r_[master.upper, np.ones(n)],
-        np.r_[np.zeros(n, bool), np.ones(n, bool)],
-        sp.csr_matrix(matrix),
-        low,
-        high,
-        requirement + choice,
-    ), names + [f"open_{bus}" for bus in master.sites]
+def _after_outages(problem: HostingProblem, n_hour: int) -> sp.csr_matrix:
+    """Flows after each outage in the unknowns [theta; P] of the hours, branch by branch."""
+    network, outages = problem.network, problem.certifier.outages
+    flow = (sp.diags(network.susceptance) @ network.incidence).tocsr()
+    n_line, count = outages.factors.shape
+    before = flow[np.repeat(np.arange(n_line), count)]
+    failed = flow[np.tile(outages.branch, n_line)]
+    after = before + sp.diags(outages.factors.ravel()) @ failed
+    units = sp.csr_matrix((after.shape[0], len(network.generators)))
+    return sp.kron(sp.identity(n_hour), sp.hstack([after, units]), format="csr")
 
 
 def _linearised(problem: HostingProblem, hours: Integers, point: Floats) -> _VoltageRows:
     """Voltage rows of the hours as `slope @ H` between bounds, hour by hour."""
     screen, ac = problem.screen, problem.ac
     assert screen is not None
-    v = ac.base[:, hours] if not point.any() else ac.solve(point, hours).require().v
-    slope = ac.flow.sensitivities(v, ac.change, problem.year.dc[hours])
-    constant = abs(v[screen.pq]) - slope @ point
+    solved = ac.solve(point, hours).require() if point.any() else ac.unhosted.take(hours)
+    slope = ac.slopes(solved, hours)
+    constant = abs(solved.v[screen.moving]) - slope @ point
     return _VoltageRows(
         slope.transpose(1, 0, 2).reshape(-1, len(point)),
         (screen.lower[:, hours] - constant).T.ravel(),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from dcvrt.planning.reactive import ReactiveExcess
+from dcvrt.planning.security import SecurityInfo
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,21 +19,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Row:
-    r"""A linear requirement on the hosted capacities: :math:`\sum_j a_j H_j \ge` `lower`.
+    r"""A linear requirement, `lower` :math:`\le \sum_j (a_j H_j + c_j S_j) \le` `upper`.
 
     Parameters
     ----------
     coefficients : mapping of bus number to float
         a_j; sites that are not named have 0.
     lower : float
-        Right-hand side, in the unit of the requirement.
+        Least value, in the unit of the requirement; minus infinity where there is none.
     label : str
         What reports call it, for instance "voltage at 75, fault 79, GFL, beta 1.15".
     site : int, optional
         The site whose facility the requirement is about. It holds only while that site is open (H > 0):
         a site without a facility has nothing that could fail. Without it the row always holds.
     unit : str
-        Unit of `lower`, for reports: "pu", "MW", "share of load"; empty where it has no name.
+        Unit of the limits, for reports: "pu", "MW", "share of load"; empty where it has no name.
+    upper : float
+        Largest value. A limit on the aggregate loss of a fault is `Row(shares, -inf, label, upper=mw)`.
+    rating : mapping of bus number to float
+        c_j, of the converter ratings S_j in MVA; needs a `Rating` in `solve`.
+    fault, mode, target : str
+        What the requirement was made from; carried over to what binds.
     """
 
     coefficients: Mapping[int, float]
@@ -39,10 +47,17 @@ class Row:
     label: str
     site: int | None = None
     unit: str = ""
+    upper: float = inf
+    rating: Mapping[int, float] = field(default_factory=dict)
+    fault: str = ""
+    mode: str = ""
+    target: str = ""
 
-    def value(self, by_site: Mapping[int, float]) -> float:
-        """Left-hand side less right-hand side at given capacities: negative when violated."""
-        return sum(a * by_site[bus] for bus, a in self.coefficients.items()) - self.lower
+    def value(self, by_site: Mapping[int, float], rating: Mapping[int, float] | None = None) -> float:
+        """Distance to the nearer limit at given capacities and ratings: negative when violated."""
+        left = sum(a * by_site[bus] for bus, a in self.coefficients.items())
+        left += sum(c * (rating or {})[bus] for bus, c in self.rating.items())
+        return min(left - self.lower, self.upper - left)
 
 
 @dataclass(frozen=True)
@@ -52,11 +67,13 @@ class Binding:
     Parameters
     ----------
     kind : str
-        `line`, `generator`, `voltage`, `row` or `bound`.
+        `line`, `generator`, `voltage`, `row`, `rating` or `bound`.
     label : str
         The line, the unit, the bus, the label of the row or the site.
     price : float
-        Hosted MW gained per unit by which the limit is relaxed (0 where it binds without a price).
+        Hosted MW gained per unit by which the limit is relaxed (0 where it binds without a price); with
+        weights or a cost of ratings, what the objective gains. Of a `rating`: per MVA of converter that the
+        site had more at the same capacity.
     unit : str
         Unit of the price.
     limit : float
@@ -65,6 +82,10 @@ class Binding:
         Hour of the year.
     bus : int, optional
         Bus of a voltage, a unit or a site.
+    outage : str
+        Branch whose outage the limit of a line follows; empty for the intact network.
+    fault, mode, target : str
+        Those of the row.
     """
 
     kind: str
@@ -74,10 +95,15 @@ class Binding:
     limit: float
     hour: int | None = None
     bus: int | None = None
+    outage: str = ""
+    fault: str = ""
+    mode: str = ""
+    target: str = ""
 
     def __str__(self) -> str:
         when = "" if self.hour is None else f" in hour {self.hour}"
-        return f"{self.kind} {self.label}{when}: {self.price:.4g} {self.unit}"
+        after = f" after the outage of {self.outage}" if self.outage else ""
+        return f"{self.kind} {self.label}{after}{when}: {self.price:.4g} {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -119,18 +145,19 @@ class VoltageInfo:
     passes : int
         Linearisations after the first.
     guard_pu : float
-        Widest guard band of a bus: hours in which the screen puts a voltage within its bus's band of a
-        limit were solved by AC power flow.
+        Guard band: hours in which a voltage was expected closer to a limit were solved by AC power flow.
     checked : int
-        Number of these hours, with the worst hour of each bus; with `one-shot` only the latter.
+        Number of hours solved, with the sample that the expectation rests on and the worst hour of each bus;
+        with `one-shot` the hour with the least room alone.
     v_error_pu : float
-        Largest difference between AC power flow and screen among the voltages within their guard bands.
+        Largest difference between AC power flow and screen among the voltages within 5e-4 pu of a limit;
+        in hours that were not solved, between what is expected and the screen.
     v_min_pu, v_max_pu : float
-        Extremes of the AC voltages at `pq` buses in them.
+        Extremes of the AC voltages in them, at all buses whose voltage can move.
     widened : int
         Bus-hours outside the limits with nothing hosted, which must only not get worse.
     room : array (hours,)
-        Least distance of a voltage to its limit in each hour as the screen has it, pu.
+        Least distance of a voltage to its limit in each hour as the screen has it, pu, at most 0.01.
     """
 
     screen: str
@@ -162,6 +189,12 @@ class Plan:
         Bound on what a better choice of open sites could add, over the total; 0 without such a choice.
     voltage : VoltageInfo or None
         None when the problem has no voltage limits.
+    rating_mva : dict of bus number to float
+        Converter rating S of each site, MVA; empty unless ratings were part of the question.
+    objective : float
+        What was maximised: the weighted total less the cost of ratings, or the least size.
+    security : SecurityInfo or None
+        None without N-1 security.
     """
 
     total_mw: float
@@ -171,12 +204,16 @@ class Plan:
     certificate: Certificate
     gap: float
     voltage: VoltageInfo | None
+    rating_mva: dict[int, float] = field(default_factory=dict)
+    objective: float = nan
+    security: SecurityInfo | None = None
 
     def table(self) -> pd.DataFrame:
         """What binds, one row each."""
         import pandas as pd
 
         columns = ["kind", "label", "hour", "bus", "price", "unit", "limit"]
+        columns += ["outage", "fault", "mode", "target"]
         return pd.DataFrame([[getattr(b, c) for c in columns] for b in self.binding], columns=columns)
 
 
@@ -187,9 +224,9 @@ class AcVerdict:
     Parameters
     ----------
     passed : bool
-        Solved in every hour, with every `pq` voltage within the limits.
+        Solved in every hour, with every voltage that can move within the limits.
     v_min_pu, v_max_pu : float
-        Extremes over `pq` buses and hours that have a solution.
+        Extremes over these voltages and the hours that have a solution.
     v_error_pu : float
         Largest difference between AC and linear screen of the least distance to a limit, over the hours in
         which either puts it below 5e-4 pu; elsewhere no limit is near and the screen may be cruder.

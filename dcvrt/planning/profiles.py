@@ -100,6 +100,9 @@ class Year:
         Data-centre load over hosted capacity d_t, above 0 and at most 1.
     sources : mapping of str to str
         Where `load`, `wind` and `dc` come from.
+    p_min, p_max : mapping of unit name to float array (hours,)
+        Limits of units that vary from hour to hour, MW: maintenance, must-run, water. They replace those of
+        the network in the dispatch of the hosting programme.
 
     Raises
     ------
@@ -112,6 +115,8 @@ class Year:
     wind: Mapping[int, Floats]
     dc: Floats
     sources: Mapping[str, str] = field(default_factory=dict)
+    p_min: Mapping[str, Floats] = field(default_factory=dict)
+    p_max: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hours", np.array(self.hours, dtype=np.int64))
@@ -120,7 +125,16 @@ class Year:
         object.__setattr__(
             self, "wind", {int(bus): np.array(mw, dtype=float) for bus, mw in self.wind.items()}
         )
-        columns = {"load": self.load, "dc": self.dc, **{f"wind[{bus}]": mw for bus, mw in self.wind.items()}}
+        for side in ("p_min", "p_max"):
+            limits = {str(unit): np.array(mw, dtype=float) for unit, mw in getattr(self, side).items()}
+            object.__setattr__(self, side, limits)
+        columns = {
+            "load": self.load,
+            "dc": self.dc,
+            **{f"wind[{bus}]": mw for bus, mw in self.wind.items()},
+            **{f"p_min[{unit}]": mw for unit, mw in self.p_min.items()},
+            **{f"p_max[{unit}]": mw for unit, mw in self.p_max.items()},
+        }
         problems = []
         if len(self.hours) == 0:
             problems.append("has no hours.")
@@ -134,6 +148,8 @@ class Year:
                 "load": ("must be a finite number above 0", ~(np.isfinite(values) & (values > 0))),
                 "dc": ("must be above 0 and at most 1", ~((values > 0) & (values <= 1))),
             }.get(name, ("must be a finite number of MW, 0 or more", ~(np.isfinite(values) & (values >= 0))))
+            if name.startswith("p_m"):
+                rule, wrong = "must be a finite number of MW", ~np.isfinite(values)
             if wrong.any():
                 k = int(np.flatnonzero(wrong)[0])
                 more = f" ({int(wrong.sum())} hours in all)" if wrong.sum() > 1 else ""
@@ -180,6 +196,8 @@ class Year:
             {bus: mw[at] for bus, mw in self.wind.items()},
             self.dc[at],
             self.sources,
+            {unit: mw[at] for unit, mw in self.p_min.items()},
+            {unit: mw[at] for unit, mw in self.p_max.items()},
         )
 
     def at(self, hour: int) -> Hour:

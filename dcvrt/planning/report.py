@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.planning.agreement import GUARD
+from dcvrt.planning.agreement import NEAR
 from dcvrt.planning.certificate import TOLERANCE_MW, Hours
-from dcvrt.planning.hour import FlowCut
+from dcvrt.planning.hour import INTACT, FlowCut
 from dcvrt.planning.master import Master, Solution
-from dcvrt.planning.plan import AcVerdict, Binding, Certificate, Plan, Row, VoltageInfo
+from dcvrt.planning.plan import AcVerdict, Binding, Certificate, Plan, VoltageInfo
+from dcvrt.planning.security import SecurityInfo
 from dcvrt.planning.voltage_screen import Tangent
 
 if TYPE_CHECKING:
@@ -39,16 +40,30 @@ def plan(
     """Put the optimum into words and numbers."""
     H = np.where(solution.H > CLOSED_MW, solution.H, 0.0)
     by_site = {bus: float(mw) for bus, mw in zip(problem.sites, H, strict=True)}
+    S = np.where(H > 0, solution.S, 0.0) if len(solution.S) else solution.S
+    rating = dict(zip(problem.sites, S.tolist(), strict=False))
     binding = _binding(problem, master, solution)
     return Plan(
         float(H.sum()),
         by_site,
         binding,
-        _closed(master, solution, by_site, binding),
+        _closed(master, by_site, rating, binding),
         certificate,
         gap,
         voltage,
+        rating,
+        solution.objective,
+        _security(problem),
     )
+
+
+def _security(problem: HostingProblem) -> SecurityInfo | None:
+    """What N-1 security covers."""
+    outages, rule = problem.certifier.outages, problem.security
+    if rule is None:
+        return None
+    pairs = problem.certifier.dispatcher.pairs
+    return SecurityInfo(rule.emergency, len(outages), outages.islanding, pairs)
 
 
 def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tuple[Binding, ...]:
@@ -56,11 +71,11 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
     found: dict[tuple[object, ...], Binding] = {}
 
     def add(binding: Binding) -> None:
-        key = (binding.kind, binding.label, binding.hour)
+        key = (binding.kind, binding.label, binding.hour, binding.outage)
         more = found[key].price if key in found else 0.0
         found[key] = Binding(**{**vars(binding), "price": binding.price + more})
 
-    for cut, price in zip(master.cuts, solution.cut_price, strict=True):
+    for cut, price in zip(solution.cuts, solution.cut_price, strict=True):
         if price <= NO_PRICE:
             continue
         if isinstance(cut.origin, FlowCut):
@@ -69,7 +84,7 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
         elif isinstance(cut.origin, Tangent):
             t, screen = cut.origin, problem.screen
             assert screen is not None
-            bus = int(problem.network.bus[screen.pq[t.bus]])
+            bus = int(problem.network.bus[screen.moving[t.bus]])
             side = "at least" if t.side < 0 else "at most"
             add(
                 Binding(
@@ -82,36 +97,73 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
                     bus,
                 )
             )
-    for row, price in zip(master.rows, solution.row_price, strict=True):
-        if price > NO_PRICE:
+    for row, dual in zip(master.rows, solution.row_dual, strict=True):
+        if abs(dual) > NO_PRICE:
             unit = f"MW per {row.unit or 'unit of the row'}"
-            add(Binding("row", row.label, float(price), unit, row.lower, bus=row.site))
-    for bus, limit, price in zip(master.sites, master.upper, solution.bound_price, strict=True):
-        if price > NO_PRICE:
-            add(Binding("bound", f"largest size of site {bus}", float(price), "MW/MW", float(limit), bus=bus))
+            limit = row.lower if dual < 0 else row.upper
+            price = float(abs(dual))
+            add(
+                Binding(
+                    "row",
+                    row.label,
+                    price,
+                    unit,
+                    limit,
+                    bus=row.site,
+                    fault=row.fault,
+                    mode=row.mode,
+                    target=row.target,
+                )
+            )
+    if len(solution.S):
+        worth = -solution.row_dual @ master.coefficients[:, master.count : 2 * master.count]
+        for bus, price, mva in zip(master.sites, worth, solution.S, strict=True):
+            if abs(price) > NO_PRICE:
+                add(Binding("rating", f"rating of site {bus}", float(price), "MW/MVA", float(mva), bus=bus))
+    for what, prices, limits in (
+        ("largest", solution.bound_price, master.upper),
+        ("smallest", solution.floor_price, master.lower),
+    ):
+        for bus, limit, price in zip(master.sites, limits, prices, strict=True):
+            if price > NO_PRICE:
+                add(
+                    Binding(
+                        "bound", f"{what} size of site {bus}", float(price), "MW/MW", float(limit), bus=bus
+                    )
+                )
     return tuple(sorted(found.values(), key=lambda b: (-b.price, b.kind, b.label)))
 
 
 def _flow_bindings(problem: HostingProblem, cut: FlowCut, price: float) -> list[Binding]:
     """Lines and units behind a flow cut, in the hour in which it is tightest."""
-    network, year = problem.network, problem.year
-    at = int(problem.certifier.corners[problem.certifier.bound(cut).argmin()])
-    hour, per_mw = int(year.hours[at]), price / year.dc[at]
+    network, hours = problem.network, problem.certifier
+    at = int(hours.corners[hours.bound(cut).argmin()])
+    hour, per_mw = int(problem.year.hours[at]), price / problem.year.dc[at]
     lines, units = network.branches, network.generators
     found = [
-        Binding("line", lines.label(b), float(weight * per_mw), "MW/MVA", float(lines.rating[b]), hour)
-        for b, weight in cut.lines
-        if weight * per_mw > NO_PRICE
+        Binding(
+            "line",
+            lines.label(line.branch),
+            float(line.weight * per_mw),
+            "MW/MVA",
+            float(hours.limit(line)),
+            hour,
+            outage="" if line.outage == INTACT else lines.label(line.outage),
+        )
+        for line in cut.lines
+        if line.weight * per_mw > NO_PRICE
     ]
-    for g, weight, at_maximum in cut.units:
-        limit = units.p_max[g] if at_maximum else units.p_min[g]
-        if weight * per_mw > NO_PRICE and (at_maximum or limit != 0):
-            what = "p_max" if at_maximum else "p_min"
+    low, high = hours.unit_limits(at)
+    reduced = cut.pi[network.generator_index]
+    for g in np.flatnonzero(abs(reduced) * per_mw > NO_PRICE).tolist():
+        at_maximum = reduced[g] < 0
+        limit = high[g] if at_maximum else low[g]
+        if at_maximum or limit != 0:
             found.append(
                 Binding(
                     "generator",
-                    f"{units.name[g]} {what}",
-                    float(weight * per_mw),
+                    f"{units.name[g]} {'p_max' if at_maximum else 'p_min'}",
+                    float(abs(reduced[g]) * per_mw),
                     "MW/MW",
                     float(limit),
                     hour,
@@ -122,7 +174,7 @@ def _flow_bindings(problem: HostingProblem, cut: FlowCut, price: float) -> list[
 
 
 def _closed(
-    master: Master, solution: Solution, by_site: dict[int, float], binding: tuple[Binding, ...]
+    master: Master, by_site: dict[int, float], rating: dict[int, float], binding: tuple[Binding, ...]
 ) -> dict[int, str]:
     """Sites without a facility, each with the requirement that opening it would break, if any."""
     reasons = {}
@@ -130,32 +182,42 @@ def _closed(
         if by_site[bus] > 0:
             continue
         opened = {**by_site, bus: float(master.lower[i])}
-        broken = sorted(
-            (row for row in master.rows if row.site == bus and row.value(opened) < 0),
-            key=lambda row: row.value(opened),
-        )
+        own = [(row.value(opened, rating), row) for row in master.rows if row.site == bus]
+        broken = sorted(((room, row) for room, row in own if room < 0), key=lambda found: found[0])
         if broken:
             others = len(broken) - 1
             more = f", and {others} more margin{'s' * (others > 1)} fall{'s' * (others == 1)} short"
-            short = f"{-broken[0].value(opened):.4g} {broken[0].unit}".rstrip()
+            room, worst = broken[0]
+            short = f"{-room:.4g} {worst.unit}".rstrip()
             reasons[bus] = (
-                f"{broken[0].label}: {short} short at {opened[bus]:g} MW beside the other sites"
+                f"{worst.label}: {short} short at {opened[bus]:g} MW beside the other sites"
                 f"{more if others else ''}"
             )
         elif master.upper[i] == 0:
             reasons[bus] = "its largest size is 0 MW"
+        elif (alone := _alone(master, i)) < master.lower[i]:
+            reasons[bus] = (
+                f"its smallest size is {master.lower[i]:g} MW, but the limits leave it at most "
+                f"{alone:.4g} MW even alone"
+            )
         else:
             limits = ", ".join(f"{b.kind} {b.label}" for b in binding[:3]) or "the other sites"
             reasons[bus] = f"hosting here gains nothing within the shared limits ({limits})"
     return reasons
 
 
+def _alone(master: Master, i: int) -> float:
+    """Largest size that the cuts leave a site when no other is open, MW: no less than it can host."""
+    bounds = [cut.b / cut.a[i] for cut in master.cuts if cut.a[i] > 0]
+    return float(min([*bounds, master.upper[i]]))
+
+
 def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
     """Judge a plan by AC power flow in every hour."""
     solved = problem.ac.solve(H)
-    pq = problem.ac.flow.pq
+    moving = problem.ac.flow.moving
     good = np.flatnonzero(solved.converged)
-    size = abs(solved.v[np.ix_(pq, good)])
+    size = abs(solved.v[np.ix_(moving, good)])
     screen = problem.screen
     if screen is None:
         low, high = np.zeros(size.shape), np.full(size.shape, np.inf)
@@ -165,11 +227,11 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         return AcVerdict(False, np.nan, np.nan, np.nan, None, None, solved.status)
     room = np.minimum(size - low, high - size)
     row, k = np.unravel_index(room.argmin(), room.shape)
-    hour, bus = int(problem.year.hours[good[k]]), int(problem.network.bus[pq[row]])
+    hour, bus = int(problem.year.hours[good[k]]), int(problem.network.bus[moving[row]])
     error = np.nan
     if found.voltage is not None:
         true, linear = room.min(axis=0), found.voltage.room[good]
-        error = float(abs(true - linear)[np.minimum(true, linear) < GUARD].max(initial=0.0))
+        error = float(abs(true - linear)[np.minimum(true, linear) < NEAR].max(initial=0.0))
     inside = bool(room[row, k] >= -AC_TOLERANCE)
     if not solved.converged.all():
         status = solved.status
@@ -215,10 +277,10 @@ def base_case(hours: Hours, rating_scale: float) -> str:
         at = int(todo[0])
         found = hours.dispatch(nothing, at)
         spent += 1
-        if found.shortfall > TOLERANCE_MW:
+        if found.cut is not None and found.shortfall > TOLERANCE_MW:
             if worst is None or found.shortfall > worst[0]:
                 worst = found.shortfall, at, found.cut
-            least = found.cut.pi @ hours.fixed[:, todo] + found.cut.constant
+            least = hours.shortfall(found.cut, todo)
             lost = least > TOLERANCE_MW
             lost[0] = True
             short.update({int(t): float(mw) for t, mw in zip(todo[lost], least[lost], strict=True)})
@@ -234,15 +296,16 @@ def base_case(hours: Hours, rating_scale: float) -> str:
     lines = network.branches
     if cut.lines:
         where = ", ".join(
-            f"{lines.label(b)} (rated {lines.rating[b]:.4g} MVA)"
-            for b, _ in sorted(cut.lines, key=lambda item: -item[1])[:4]
+            f"{lines.label(line.branch)} (rated {hours.limit(line):.4g} MVA"
+            + (")" if line.outage == INTACT else f" after the outage of {lines.label(line.outage)})")
+            for line in sorted(cut.lines, key=lambda line: -line.weight)[:4]
         )
         cause = f"branches are overloaded by {amount:.4g} MW whatever the dispatch: {where}"
         way = f"a larger rating_scale (now {rating_scale:g}), or more generation behind these branches"
     else:
-        units = network.generators
+        low, high = hours.unit_limits(at)
         cause = (
-            f"units that give {units.p_min.sum():.5g} to {units.p_max.sum():.5g} MW cannot meet a net load "
+            f"units that give {low.sum():.5g} to {high.sum():.5g} MW cannot meet a net load "
             f"of {demand[at]:.5g} MW ({amount:.4g} MW off)"
         )
         way = "more units, or other limits of theirs"
@@ -252,12 +315,32 @@ def base_case(hours: Hours, rating_scale: float) -> str:
     )
 
 
-def no_plan(rows: tuple[Row, ...]) -> str:
-    """Say that rows which belong to no site exclude every plan."""
-    general = [row.label for row in rows if row.site is None]
-    listed = ", ".join(general[:6]) + (", ..." if len(general) > 6 else "")
+def no_plan(master: Master) -> str:
+    """Say which of the rows that belong to no site exclude every plan, and by how much."""
+    general = [row for row in master.rows if row.site is None]
+    missed = master.least_violations()
+    if missed is None or not (missed > NO_PRICE).any():
+        listed = ", ".join(row.label for row in general[:6]) + (", ..." if len(general) > 6 else "")
+        named = f"Rows that hold for every plan: {listed or 'none'}."
+    else:
+        worst = np.argsort(-missed)
+        parts = [
+            f"{master.rows[r].label} ({missed[r]:.4g} {master.rows[r].unit}".rstrip() + " short at least)"
+            for r in worst[:6].tolist()
+            if missed[r] > NO_PRICE
+        ]
+        named = f"Missed: {', '.join(parts)}."
     return (
-        "No capacities meet all requirement rows, not even with every site closed. Rows that hold for "
-        f"every plan: {listed or 'none'}. Ways out: give a row the site that it belongs to, so that the site "
-        "can be closed, or relax its limit."
+        f"No capacities meet all requirement rows, not even with every site closed. {named} "
+        "Ways out: give a row the site that it belongs to, so that the site can be closed, or relax its "
+        "limit."
+    )
+
+
+def sizes_too_large(sizes: dict[int, float], share: float) -> str:
+    """Say that sites which must be open cannot all have their smallest size."""
+    listed = ", ".join(f"{mw:g} MW at {bus}" for bus, mw in sizes.items())
+    return (
+        f"The smallest sizes of the sites that must be open exceed the limits: {listed}. At most "
+        f"{100 * share:.1f} % of them fit together. Ways out: smaller sizes, or let a site close."
     )

@@ -79,7 +79,18 @@ def margin_rows(
                 closed[fit.site] = f"no capacity in the sampled box passes: {label}"
                 break
             coefficients = dict(zip(sites, a.tolist(), strict=True))
-            rows.append(Row(coefficients, lower, label, site=fit.site, unit=_unit(fit)))
+            rows.append(
+                Row(
+                    coefficients,
+                    lower,
+                    label,
+                    site=fit.site,
+                    unit=_unit(fit),
+                    fault=str(fit.fault),
+                    mode=fit.mode,
+                    target=fit.target,
+                )
+            )
     return [row for row in rows if row.site not in closed], closed
 
 

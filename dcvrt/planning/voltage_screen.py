@@ -1,10 +1,9 @@
-"""The linear voltage screen: voltages of every `pq` bus and hour as affine functions of the capacities."""
+"""The linear voltage screen: voltages of every moving bus and hour as affine functions of the capacities."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,17 +12,22 @@ from dcvrt.errors import InfeasibleError
 from dcvrt.grid.network import Network
 from dcvrt.grid.powerflow import HourlySolution, PowerFlow, hosting_directions, injections
 from dcvrt.planning import reactive
+from dcvrt.planning.interpolation import VoltageDrop
 from dcvrt.planning.profiles import Year
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+BUSES_A_ROUND = 4
+"""Buses whose violated limits become cuts together."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tangent:
     """One voltage as an affine function of the capacities: `constant + slope @ H` against a limit.
 
-    `side` is -1 for the lower and +1 for the upper limit; `bus` counts `pq` buses, `hour` counts hours.
+    `side` is -1 for the lower and +1 for the upper limit; `bus` counts moving buses, `hour` counts hours.
     """
 
     bus: int
@@ -52,38 +56,54 @@ class Tangent:
 class HostedFlow:
     """AC power flow of the operating hours at any capacities.
 
-    The units follow the hosted load as `powerflow.dispatch` says, the slack takes losses, and `pv` buses hold
-    their voltage without reactive limits; `reactive_excess` says how far units are beyond them.
+    The units follow the hosted load as `powerflow.dispatch` says and the slack takes losses. `pv` buses hold
+    their voltage, with `reactive_limits` as far as their units can.
     """
 
-    def __init__(self, network: Network, sites: tuple[int, ...], year: Year, pf: float) -> None:
+    def __init__(
+        self, network: Network, sites: tuple[int, ...], year: Year, pf: float, reactive_limits: bool = True
+    ) -> None:
         self.network, self.year = network, year
-        self.flow = PowerFlow(network)
+        self.flow = PowerFlow(network, reactive_limits)
         self.change = hosting_directions(network, sites, pf)
         self.scheduled = injections(network, year.load, year.wind)
         self._all = np.arange(len(year))
-        self._latest: npt.NDArray[np.complex128] | None = (
-            None  # the next capacities are mostly near the last ones
-        )
+        self._latest: HourlySolution | None = None  # the next capacities are mostly near the last ones
 
     @cached_property
+    def unhosted(self) -> HourlySolution:
+        """Power flow with nothing hosted; raises `SimulationError` where there is none."""
+        return self.flow.solve_hours(self.scheduled, hours=self.year.hours).require()
+
+    @property
     def base(self) -> npt.NDArray[np.complex128]:
-        """Voltages with nothing hosted, (buses, hours); raises `SimulationError` where there are none."""
-        return self.flow.solve_hours(self.scheduled, hours=self.year.hours).require().v
+        """Voltages with nothing hosted, (buses, hours)."""
+        return self.unhosted.v
 
     def solve(self, H: Floats, hours: Integers | None = None) -> HourlySolution:
         """AC power flow at `H` of the hours at the given positions (default all)."""
         at = self._all if hours is None else hours
+        base = self.unhosted
         if self._latest is None:
-            self._latest = self.base.copy()
-        demand = self._demand(H, at)
-        solved = self.flow.solve_hours(demand, start=self._latest[:, at], hours=self.year.hours[at])
-        self._latest[:, at] = np.where(solved.converged, solved.v, self.base[:, at])
+            self._latest = replace(base, v=base.v.copy(), limited=base.limited.copy())
+        latest = self._latest
+        solved = self.flow.solve_hours(
+            self._demand(H, at),
+            start=latest.v[:, at],
+            hours=self.year.hours[at],
+            limited=latest.limited[:, at],
+        )
+        latest.v[:, at] = np.where(solved.converged, solved.v, base.v[:, at])
+        latest.limited[:, at] = np.where(solved.converged, solved.limited, base.limited[:, at])
         return solved
 
     def _demand(self, H: Floats, at: Integers) -> npt.NDArray[np.complex128]:
         """Scheduled injections at `H`, MVA, (buses, hours)."""
         return self.scheduled[:, at] + np.outer(self.change.T @ H, self.year.dc[at])
+
+    def slopes(self, solved: HourlySolution, at: Integers) -> Floats:
+        """Derivative of every moving voltage by the capacities, pu/MW, (moving buses, hours, sites)."""
+        return self.flow.sensitivities(solved.v, self.change, self.year.dc[at], solved.limited)
 
     def reactive_excess(
         self, H: Floats, v: npt.NDArray[np.complex128], hours: Integers
@@ -125,30 +145,36 @@ class VoltageScreen:
 
     def __init__(self, ac: HostedFlow, limits: tuple[float, float], base_violations: str) -> None:
         self.ac, self.network, self.year, self.limits = ac, ac.network, ac.year, limits
-        self.pq = ac.flow.pq
-        size = abs(ac.base[self.pq])
-        self.slope = ac.flow.sensitivities(ac.base, ac.change, self.year.dc)
+        self.moving = ac.flow.moving
+        size = self.sizes(ac.unhosted)
+        self.unhosted = size
+        self.interpolation = VoltageDrop(ac.year)
+        self.slope = ac.slopes(ac.unhosted, np.arange(len(self.year)))
         self.constant = size.copy()
         self.lower = np.minimum(limits[0], size)
         self.upper = np.maximum(limits[1], size)
+        # Extremes over the hours, from which `near` bounds voltages for H >= 0.
+        self._constant_range = self.constant.min(axis=1), self.constant.max(axis=1)
+        self._slope_range = self.slope.min(axis=1), self.slope.max(axis=1)
+        self._tightest = self.lower.max(axis=1), self.upper.min(axis=1)
         outside = (size < limits[0]) | (size > limits[1])
         self.widened = int(outside.sum())
         if base_violations == "error":
             self._refuse(size, outside)
 
-    def _refuse(self, size: npt.NDArray[np.floating[Any]], outside: npt.NDArray[np.bool_]) -> None:
-        """Raise when the base case violates the limits at `pq` buses or at set points."""
+    def _refuse(self, size: Floats, outside: npt.NDArray[np.bool_]) -> None:
+        """Raise when the base case violates the limits at moving buses or at set points."""
         network, (low, high) = self.network, self.limits
         lines = []
         for i in np.flatnonzero(outside.any(axis=1)):
             hours = np.flatnonzero(outside[i])
             k = hours[np.maximum(low - size[i, hours], size[i, hours] - high).argmax()]
             lines.append(
-                f"bus {network.bus[self.pq[i]]}: outside in {len(hours)} hours, worst {size[i, k]:.4f} pu "
-                f"in hour {self.year.hours[k]}"
+                f"bus {network.bus[self.moving[i]]}: outside in {len(hours)} hours, "
+                f"worst {size[i, k]:.4f} pu in hour {self.year.hours[k]}"
             )
-        held = np.array(network.kind) != "pq"
-        for i in np.flatnonzero(held & ((network.v_set < low) | (network.v_set > high))):
+        held = np.setdiff1d(np.arange(len(network.bus)), self.moving)
+        for i in np.intersect1d(held, np.flatnonzero((network.v_set < low) | (network.v_set > high))):
             lines.append(f"bus {network.bus[i]}: holds its set point {network.v_set[i]:.4f} pu")
         if not lines:
             return
@@ -162,9 +188,40 @@ class VoltageScreen:
 
     # -- rows ----------------------------------------------------------------------------------------------
 
-    def voltages(self, H: Floats) -> Floats:
-        """Linear voltages at all `pq` buses and hours, pu."""
-        return self.constant + (self.slope.reshape(-1, len(H)) @ H).reshape(self.constant.shape)
+    def sizes(self, solved: HourlySolution) -> Floats:
+        """Voltages of the moving buses in a power flow, pu, (moving buses, hours)."""
+        return np.asarray(abs(solved.v[self.moving]), dtype=np.float64)
+
+    def near(self, H: Floats, margin: float) -> Integers:
+        """Rows, places of moving buses, in which the screen may come within `margin` pu of a limit in some
+        hour; elsewhere the extremes of the hours show that it does not."""
+        least = self._constant_range[0] + self._slope_range[0] @ H
+        most = self._constant_range[1] + self._slope_range[1] @ H
+        return np.flatnonzero((least < self._tightest[0] + margin) | (most > self._tightest[1] - margin))
+
+    def _widen_ranges(self, hours: Integers, rows: Integers | None = None) -> None:
+        """Take what changed in some hours, and in all hours of some rows, into the extremes."""
+        for values, (least, most) in (
+            (self.constant, self._constant_range),
+            (self.slope, self._slope_range),
+        ):
+            np.minimum(least, values[:, hours].min(axis=1), out=least)
+            np.maximum(most, values[:, hours].max(axis=1), out=most)
+            if rows is not None:
+                least[rows], most[rows] = values[rows].min(axis=1), values[rows].max(axis=1)
+
+    def voltages(self, H: Floats, rows: Integers | None = None) -> Floats:
+        """Linear voltages in all hours, of all moving buses or of some rows of them, pu."""
+        slope, constant = (
+            (self.slope, self.constant) if rows is None else (self.slope[rows], self.constant[rows])
+        )
+        return constant + (slope.reshape(-1, len(H)) @ H).reshape(constant.shape)
+
+    def room(self, voltage: Floats, rows: Integers, hours: Integers | slice = slice(None)) -> Floats:
+        """Distance of voltages, (rows, hours), to the nearer limit, pu; negative beyond it."""
+        at = (rows, slice(None)) if isinstance(hours, slice) else np.ix_(rows, hours)
+        low, high = self.lower[at], self.upper[at]
+        return np.minimum(voltage - low, high - voltage)
 
     def tangent(self, bus: int, hour: int, side: int) -> Tangent:
         """The present linearisation of one voltage against one of its limits."""
@@ -174,20 +231,42 @@ class VoltageScreen:
         )
 
     def violated(self, H: Floats, tolerance: float) -> list[Tangent]:
-        """The most violated lower and the most violated upper limit."""
-        now = self.voltages(H)
+        """The most violated lower and upper limit of each of the buses with the worst."""
+        rows = self.near(H, 0.0)
+        if not len(rows):
+            return []
+        now = self.voltages(H, rows)
         found = []
-        for side, over in ((-1, self.lower - now), (1, now - self.upper)):
-            bus, hour = divmod(int(over.argmax()), over.shape[1])
-            if over[bus, hour] > tolerance:
-                found.append(self.tangent(bus, hour, side))
+        for side, over in ((-1, self.lower[rows] - now), (1, now - self.upper[rows])):
+            hour = over.argmax(axis=1)
+            worst = over[np.arange(len(rows)), hour]
+            for k in np.argsort(-worst, kind="stable")[:BUSES_A_ROUND].tolist():
+                if worst[k] > tolerance:
+                    found.append(self.tangent(int(rows[k]), int(hour[k]), side))
         return found
 
-    def relinearise(self, H: Floats, hours: Integers, v: npt.NDArray[np.complex128], steep: Integers) -> None:
-        """Make the screen exact at `H` in `hours`, with new slopes in those of them at places `steep`.
+    def relinearise(
+        self,
+        H: Floats,
+        hours: Integers,
+        solved: HourlySolution,
+        steep: Integers,
+        rows: Integers,
+        expected: Floats | None,
+    ) -> None:
+        """Make the screen exact at `H` in `hours`, with new slopes in those of them at places `steep`, and as
+        expected in all other hours of some rows.
 
-        `v` are the AC voltages at `H`, (buses, len(hours)).
+        Parameters
+        ----------
+        solved : HourlySolution
+            AC power flow at `H` of the hours.
+        expected : array (rows, all hours) or None
+            Voltages, pu; None leaves the other hours as they are.
         """
+        if expected is not None:
+            self.constant[rows] += expected - self.voltages(H, rows)
         chosen = hours[steep]
-        self.slope[:, chosen] = self.ac.flow.sensitivities(v[:, steep], self.ac.change, self.year.dc[chosen])
-        self.constant[:, hours] = abs(v[self.pq]) - self.slope[:, hours] @ H
+        self.slope[:, chosen] = self.ac.slopes(solved.take(steep), chosen)
+        self.constant[:, hours] = self.sizes(solved) - self.slope[:, hours] @ H
+        self._widen_ranges(hours, rows if expected is not None else None)

@@ -158,16 +158,17 @@ def against(
 
 def table_of(outcomes: list[Outcome]) -> Table:
     """The verdicts for a terminal."""
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    table = Table()
-    for heading, justify in (
-        ("segment", "left"), ("V, Hz, deg", "right"), ("verdict", "left"), ("connected", "left"),
-        ("afterwards", "left"), ("margins", "left"), ("IT V, pu", "right"), ("what it did", "left"),
-        ("evidence", "left"),
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for heading, justify, whole in (
+        ("segment", "left", False), ("V, Hz,\ndeg", "right", True), ("verdict", "left", True),
+        ("margins", "left", True), ("IT V,\npu", "right", True), ("evidence", "left", True),
+        ("what happened", "left", False),
     ):  # fmt: skip
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+        table.add_column(heading, justify=justify, no_wrap=whole, overflow="fold")  # type: ignore[arg-type]
     colours = {"pass": "green", "FAIL": "bold red", "no verdict": "yellow"}
     for o in outcomes:
         trial = o.trial
@@ -177,9 +178,10 @@ def table_of(outcomes: list[Outcome]) -> Table:
         table.add_row(
             *(Text(x) for x in (label, "" if math.isnan(trial.level) else f"{trial.level:.4g}")),
             Text(o.word, style=colours[o.word]),
-            *(Text(x) for x in (o.connection, o.return_, o.margins)),
+            Text(o.margins.replace(", ", "\n")),
             "" if math.isnan(o.it_margin) else f"{o.it_margin:+.3f}",
-            *(Text(x) for x in (o.mechanism, trial.mark)),
+            Text(trial.mark),
+            Text("; ".join(filter(None, (o.connection, o.return_, o.mechanism)))),
         )  # fmt: skip
     return table
 

@@ -152,6 +152,7 @@ class Study:
             rating_scale=h.rating_scale,
             voltage=(h.v_min_pu, h.v_max_pu),
             pf=h.pf,
+            reactive_limits=False,  # as in the fault simulation that replays the plans
         )
         chosen = year.representative(network)
         periods = {}

@@ -12,6 +12,11 @@ from dcvrt.integrators import Casadi
 from dcvrt.models import Block, Diagram, Equations, Input, State
 from dcvrt.trajectory import Trajectory
 
+FIXED = (
+    "v_it", "p_g", "q_g", "i_g", "i_max", "p_b", "soc", "w_dc", "p_load", "p_out", "p_it", "p_cool", "mode",
+    "stored", "p_loss",
+)  # fmt: skip
+"""Outputs of every variant, in their order."""
 TIGHT = Casadi("erk", rtol=1e-9, atol=1e-11)
 
 

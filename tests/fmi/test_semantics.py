@@ -337,6 +337,34 @@ def _keep(values: np.ndarray) -> object:
     return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
 
 
+# -- parameters that do not go together ---------------------------------------------------------------------
+
+
+def test_a_bound_parameter_stays_within_the_bounds_of_its_block(made: Make) -> None:
+    d = Diagram("bound")
+    gain = d.parameter("H", 2.0, "1", (0.0, 100.0))
+    leak = d.add("leak", Leak())
+    d.bind(leak, k=3 * gain)
+    d.output("x", leak.x)
+    unit = made(d.compile())
+    with unit.instance() as fmu:
+        fmu.setFloat64(unit.references("H"), [20.0])
+        fmu.enterInitializationMode()
+        with pytest.raises(Exception, match="fmi3ExitInitializationMode"):
+            fmu.exitInitializationMode()
+        assert unit.messages() == ["leak.k (bound to 3*H) = 60 1/s is outside [0, 10]."]
+
+
+class Leak(Block):
+    """x' = -k x."""
+
+    k = Parameter(1.0, "1/s", (0.0, 10.0), "rate", "test")
+    x = State(0.0, "1", "what is left")
+
+    def equations(self, s: object) -> Equations:
+        return Equations(der=dict(x=-s.k * s.x))  # type: ignore[attr-defined]
+
+
 # -- calls out of order -------------------------------------------------------------------------------------
 
 

@@ -20,6 +20,16 @@ CASES = {
     "ieee14": ("ieee14/ieee14.raw", "ieee14/ieee14.dyr"),
     "ieee39": ("ieee39/ieee39_full.xlsx", None),
 }
+FURTHER = {
+    "sexs": ("kundur/kundur_sexs.xlsx", None),
+    "exst1": ("kundur/kundur_exst1.xlsx", None),
+    "esst3a": ("kundur/kundur_esst3a.xlsx", None),
+    "ieeet1": ("ieee14/ieee14_ieeet1.xlsx", None),
+    "ieeest": ("kundur/kundur_ieeest.xlsx", None),
+    "frequency": ("kundur/kundur_ieeest.xlsx", None),
+    "npcc": ("npcc/npcc.xlsx", None),
+}
+"""Cases for models that the others lack; npcc has GENCLS, `frequency` lets the stabilisers read that."""
 
 STATES = {
     "GENROU": dict(delta="delta", omega="omega", e_q1="e1q", e_d1="e1d", e_d2="e2d", e_q2="e2q"),
@@ -57,16 +67,27 @@ def package() -> Path:
 @cache
 def system(case: str) -> Any:
     """A case after power flow and initialisation."""
+    return fresh(case)
+
+
+def fresh(case: str, fault: int | None = None) -> Any:
+    """A case of one's own, with a fault device (switched off) on request."""
     if case == "ieee118":
         ss = andes.read(andes.case118())
         with andes.quiet():
             andes.add_machines(ss, dynamics118.machines(Network.ieee118()))
     else:
-        path, dynamics = CASES[case]
+        path, dynamics = (CASES | FURTHER)[case]
         ss = andes.read(package() / path, package() / dynamics if dynamics else None)
     with andes.quiet():
+        if fault is not None:
+            ss.add("Fault", {"idx": "fault", "bus": fault, "tf": 1e3, "tc": 2e3, "xf": 1e-4, "rf": 0.0})
+        if case == "frequency":
+            ss.IEEEST.MODE.v = [2.0] * ss.IEEEST.n
+            ss.Toggle.u.v = [0.0] * ss.Toggle.n
         ss.setup()
         ss.PFlow.run()
+        ss.TDS.config.no_tqdm = 1
         ss.TDS.init()
     return ss
 
@@ -153,6 +174,6 @@ def start_flags(dae: Dae) -> np.ndarray:
 
 
 __all__ = [
-    "CASES", "controls", "functions", "power", "read_units", "start_flags", "state", "system", "values",
-    "voltage",
+    "CASES", "FURTHER", "controls", "fresh", "functions", "place", "power", "read_units", "start_flags",
+    "state", "system", "values", "voltage",
 ]  # fmt: skip

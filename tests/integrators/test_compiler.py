@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shlex
+import signal
 import stat
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -56,6 +59,44 @@ def test_processes_may_compile_the_same_object_at_once() -> None:
     ]
     assert [w.communicate()[0].strip() for w in workers] == ["25.0"] * 3
     assert [p.suffix for p in cache_folder().iterdir()] == [".so"]
+
+
+@needs_compiler
+@pytest.mark.usefixtures("_fresh_cache")
+def test_a_killed_compile_leaves_nothing_that_is_taken_for_an_object(
+    tmp_path: Path,
+) -> None:
+    found = find_compiler()
+    assert found is not None
+    real, slow, started = shlex.join(found.command), tmp_path / "slow-cc", tmp_path / "started"
+    slow.write_text(
+        f'#!/bin/sh\ncase "$1" in --version|-d*) exec {real} "$@";; esac\n'
+        f'for last; do if [ "$before" = -o ]; then echo half > "$last"; fi; before=$last; done\n'
+        f"echo $$ > {started}\nexec sleep 600\n"
+    )
+    slow.chmod(0o755)
+    code = (
+        "import casadi as ca; from dcvrt.integrators.compiler import compiled; x = ca.SX.sym('x');"
+        "print(float(compiled([ca.Function('square', [x], [x * x])])[0]['square'](5.0)))"
+    )
+    worker = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "CC": str(slow)})
+    while not (started.exists() and started.read_text().strip()):
+        assert worker.poll() is None
+        time.sleep(0.02)
+    worker.kill()
+    worker.wait()
+    os.kill(int(started.read_text()), signal.SIGKILL)
+    (left,) = cache_folder().iterdir()
+    assert left.is_dir()
+    assert (left / "model.so").read_text() == "half\n"
+    functions, _ = compiler.compiled([square()])
+    assert float(functions["square"](5.0)) == 25.0
+    assert left.exists()  # it might still be at work
+    os.utime(left, (0, 0))
+    x = ca.SX.sym("x")
+    functions, _ = compiler.compiled([ca.Function("cube", [x], [x**3])])
+    assert float(functions["cube"](2.0)) == 8.0
+    assert {p.suffix for p in cache_folder().iterdir()} == {".so"}
 
 
 @pytest.mark.usefixtures("_fresh_cache")

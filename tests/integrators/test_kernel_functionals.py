@@ -24,7 +24,7 @@ from dcvrt.functionals import (
 from dcvrt.integrators import Casadi, Simulator
 from dcvrt.integrators.batch import BatchResult
 from dcvrt.integrators.compiler import find_compiler
-from dcvrt.integrators.kernel import Kernel
+from dcvrt.integrators.kernel import Kernel, build
 from dcvrt.waveform import Waveform
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -150,3 +150,31 @@ def test_gradients_of_the_kernel_equal_differences_of_the_kernel(mode: str, name
             compared.add((f, theta))
     assert len({f for f, _ in compared}) >= {"deep": 4, "energy": 8}.get(name, 6)  # deep: no import for long
     assert len({theta for _, theta in compared}) >= 3
+
+
+JUMP = "(moved[i] - s.d[i]) * dte[j]"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_without_the_jump_term_the_comparison_fails(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver without (f- - f+) dt_e/dtheta: gradients of several functionals are off by more than 5 %."""
+    whole = build.sources
+
+    def lacking(*given: object) -> dict[str, str]:
+        files = whole(*given)  # type: ignore[arg-type]
+        assert files["course.c"].count(JUMP) == 1
+        return {**files, "course.c": files["course.c"].replace(JUMP, "0.0 * dte[j]")}
+
+    case = [cases(mode)["energy"]]
+    right = batch(simulator(mode, 1e-9), mode, case).functionals[0]
+    monkeypatch.setattr(build, "sources", lacking)
+    wrong = batch(Simulator(system(mode), Kernel(rtol=1e-9, atol=1e-11), wrt=THETAS), mode, case).functionals[
+        0
+    ]
+    missed = set()
+    for f, outcome in right.items():
+        assert wrong[f].value == pytest.approx(outcome.value, abs=1e-6, nan_ok=True)
+        slopes = np.array([outcome.grad[n] for n in THETAS]), np.array([wrong[f].grad[n] for n in THETAS])
+        if np.any(np.abs(slopes[0] - slopes[1]) > 0.05 * np.abs(slopes[0])):
+            missed.add(f)
+    assert len(missed) >= 4

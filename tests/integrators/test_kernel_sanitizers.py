@@ -42,10 +42,9 @@ struct keep *keep_new(void);
 void keep_free(struct keep *);
 int keep_run(struct keep *, const struct task *, const struct options *, struct result *, struct record *);
 void keep_states(struct keep *, long, const double *, const long *, double *, double *);
+int keep_samples(struct keep *, const struct corners *, struct record *);
 void results_free(struct result *, long);
 void rests_of(long, const double *, const double *, const double *, double *, double *, int *);
-int outputs_on(const struct task *, const struct phase *, long, const double *, const double *,
-               const double *, const long *, const long *, double *, double *, double *, double *);
 
 int main(void)
 {
@@ -76,6 +75,10 @@ int main(void)
                     r.sample_phase, y, y + m, y + 2 * m, y + 2 * m + m * NW))
         return 5;
     printf("%d %ld %ld %.17g\\n", result.status, result.events, r.samples, r.sample_x[(r.samples - 1) * N]);
+    struct corners corners = {2e-5, 1.5, 8, 5};
+    long before = r.samples;
+    if (!keep_samples(keep, &corners, &r) || r.samples < before) return 7;
+    if (NY && r.sample_y[(r.samples - 1) * NY] != y[(before - 1) * NY]) return 8;
     free(y);
     keep_free(keep);
     for (int k = 0; k < CASES; k++) tasks[k] = task;

@@ -175,10 +175,22 @@ def test_values_of_a_run_that_take_the_hysteresis_away_are_refused_before_it():
     assert simulator(sag, **both).completed
 
 
-class Follower(Switch):
+class Referred(Block):
+    """Two modes on a signal and a reference that varies in time."""
+
+    modes = ("LOW", "HIGH")
+    start = "LOW"
+    v = Input("1", "signal")
+    ref = Input("1", "reference")
+    x = State(0.0, "s", "integral of the signal")
+
+    def equations(self, s):
+        return Equations(der={"x": s.v})
+
+
+class Follower(Referred):
     """Limits that vary in time, a fixed distance apart."""
 
-    ref = Input("1", "reference")
     gap = Parameter(0.1, "1", (-1, 1), "distance of the limits")
 
     def transitions(self, s):
@@ -209,8 +221,10 @@ def test_the_distance_of_limits_that_move_together_is_checked():
 
 
 def test_limits_that_vary_on_their_own_are_left_to_the_run():
-    class Free(Follower):
+    class Free(Referred):
         """Nothing can be said of the distance before a run."""
+
+        down = Parameter(0.4, "1", (0, 1), "to LOW below")
 
         def transitions(self, s):
             return (Go("LOW", "HIGH", above(s.v, s.ref)), Go("HIGH", "LOW", below(s.v, s.down)))
@@ -219,8 +233,11 @@ def test_limits_that_vary_on_their_own_are_left_to_the_run():
 
 
 def test_guards_on_different_signals_that_can_be_true_together_are_refused():
-    class Blind(Follower):
+    class Blind(Referred):
         """Leaves on one signal, comes back on another."""
+
+        up = Parameter(0.6, "1", (0, 1), "to HIGH above")
+        down = Parameter(0.4, "1", (0, 1), "to LOW below")
 
         def transitions(self, s):
             return (Go("LOW", "HIGH", above(s.v, s.up)), Go("HIGH", "LOW", below(s.ref, s.down)))

@@ -502,7 +502,7 @@ def test_ports_by_path():
 def test_a_shared_parameter_starts_within_its_bounds():
     with pytest.raises(InputError) as error:
         Diagram("d").parameter("beta", 3.0, "1", (0.8, 2.0))
-    assert str(error.value) == "beta = 3 is outside [0.8, 2]."
+    assert str(error.value) == "d: beta = 3 is outside [0.8, 2]."
 
 
 def test_deviations_from_the_paper_are_collected():

@@ -9,7 +9,7 @@ import pytest
 
 from dcvrt import Simulator, Waveform
 from dcvrt.errors import ModelError
-from dcvrt.models import Block, Diagram, Droop, Parameter, Phasor, Vsm
+from dcvrt.models import Block, Diagram, Droop, Phasor, Vsm
 from tests.models.sources import TIGHT, Constant, DqPower, Signal, play, steps
 
 approx = pytest.approx
@@ -150,15 +150,6 @@ def test_it_freezes_and_thaws_at_its_two_voltages():
     assert signal(up) == approx(0.85, abs=1e-9)
     held = (run.t > down) & (run.t < up)
     assert np.ptp(run["delta"][held]) < 1e-12
-
-
-def test_what_it_shares_with_the_virtual_machine_has_the_same_values():
-    ours, theirs = Droop.declared(Parameter), Vsm.declared(Parameter)
-    common = (ours.keys() & theirs.keys()) - {"K_Q"}
-    assert common == {"H", "R_v", "X_v", "f_B", "E_min", "E_max", "T_0", "K_s", "eps"}
-    for name in common:
-        a, b = ours[name], theirs[name]
-        assert (a.value, a.unit, a.bounds, a.doc, a.source) == (b.value, b.unit, b.bounds, b.doc, b.source)
 
 
 def test_the_thaw_is_above_the_freeze():

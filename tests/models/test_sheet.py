@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from dcvrt import facility
 from dcvrt.errors import InputError
 from dcvrt.models import Block, Diagram, Equations, Input, Output, Parameter, State
+from dcvrt.models.declared import Declared
 from dcvrt.models.expressions import text_of
+from dcvrt.models.netlist import netlist
 from dcvrt.models.prose import Formula, Items, Table, Text, parse
 from dcvrt.models.sheet import contents
 from dcvrt.models.sheet_forms import terminal
@@ -206,16 +208,43 @@ def test_text_in_latex_is_escaped():
 # ---- terminal ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", facility.names())
-def test_a_terminal_shows_no_latex_and_stays_within_its_width(name):
+def printed(name, width):
     from rich.console import Console
 
-    console = Console(width=100, record=True, file=io.StringIO())
-    for part in terminal(contents(facility.get(name))):
+    console = Console(width=width, record=True, file=io.StringIO())
+    for part in terminal(contents(facility.get(name)), width):
         console.print(part)
-    text = console.export_text()
-    assert max(len(line) for line in text.splitlines()) <= 100
-    assert not re.search(r"\\[a-zA-Z]+|\$", text)
+    return console.export_text()
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("name", facility.names())
+def test_a_terminal_shows_no_latex_and_stays_within_its_width(name, width):
+    text = printed(name, width)
+    assert max(len(line) for line in text.splitlines()) <= width
+    assert not re.search(r"\\[a-zA-Z]+|\$|…", text)
+    # headings, symbols, units and numbers stand whole; only prose and long expressions are broken
+    words = set(text.split())
+    net = netlist(facility.get(name))
+    for block in net.blocks.values():
+        assert {*block.flags, *block.modes} <= words
+        assert {*block.declared(Declared)} <= words
+    for row in facility.get(name).compile().parameter_rows:
+        bounds = f"[{row.bounds[0]:g}, {row.bounds[1]:g}]"
+        assert re.search(
+            rf"^ ?{row.path.rpartition('.')[2]} +{re.escape(f'{row.value:g}')} +{re.escape(row.unit)} +"
+            rf"{re.escape(bounds)} ",
+            text,
+            re.MULTILINE,
+        ), row.path
+
+
+def test_a_narrow_terminal_shows_the_source_under_the_meaning():
+    rows = [line.strip() for line in printed("gfl", 80).splitlines()]
+    at = next(k for k, row in enumerate(rows) if row.startswith("V_dip "))
+    assert rows[at].endswith("leave NORMAL below")
+    assert rows[at + 1] == "illustrative: the paper prints none"
+    assert re.search(r"V_dip .* leave NORMAL below +illustrative", printed("gfl", 120))
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,9 @@ def test_relinearised_screen_agrees_with_ac_and_one_shot_overstates() -> None:
     year = window(8400, 168)
     plans = {}
     for name in ("one-shot", "relinearised"):
-        problem = HostingProblem(NETWORK, SITES, year, rating_scale=0.6, voltage_screen=name)
+        problem = HostingProblem(
+            NETWORK, SITES, year, rating_scale=0.6, voltage_screen=name, reactive_limits=False
+        )
         plan = problem.solve()
         plans[name] = plan, problem.check_ac(plan)
     (loose, loose_ac), (tight, tight_ac) = plans["one-shot"], plans["relinearised"]
@@ -208,7 +210,10 @@ def test_largest_size_binds_with_a_price_of_one() -> None:
         ("bound", bus, pytest.approx(1.0)) for bus in (106, 108, 21, 75)
     ]
     assert str(plan.binding[2]) == "bound largest size of site 21: 1 MW/MW"
-    assert list(plan.table().columns) == ["kind", "label", "hour", "bus", "price", "unit", "limit"]
+    assert list(plan.table().columns) == [
+        *("kind", "label", "hour", "bus", "price", "unit", "limit"),
+        *("outage", "fault", "mode", "target"),
+    ]
 
 
 def test_unit_limits_are_named_where_generation_is_short() -> None:
@@ -227,10 +232,10 @@ def test_unit_limits_are_named_where_generation_is_short() -> None:
 
 @pytest.mark.slow
 def test_year_is_solved_certified_and_passes_ac() -> None:
-    problem = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+    problem = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, reactive_limits=False)
     plan = problem.solve()
     assert plan.certificate.hours == 8760
     assert problem.check_ac(plan).passed
     assert plan.total_mw == pytest.approx(365.5527, abs=1e-3)
-    week = HostingProblem(NETWORK, SITES, window(8400, 168), rating_scale=0.6).solve()
+    week = HostingProblem(NETWORK, SITES, window(8400, 168), rating_scale=0.6, reactive_limits=False).solve()
     assert plan.total_mw <= week.total_mw + 1e-4

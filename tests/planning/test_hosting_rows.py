@@ -21,7 +21,7 @@ YEAR = profiles.ieee118().window(range(8424, 8448))
 
 @pytest.fixture(scope="module")
 def problem() -> HostingProblem:
-    return HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+    return HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, reactive_limits=False)
 
 
 def margin(site: int, intercept: float, slope: float, label: str = "") -> Row:
@@ -138,7 +138,10 @@ def test_smallest_size_closes_a_site_that_cannot_reach_it() -> None:
     )
     plan = small.solve()
     assert plan.by_site[21] == 0.0
-    assert plan.closed[21].startswith("hosting here gains nothing within the shared limits (voltage bus")
+    alone = HostingProblem(NETWORK, (21,), YEAR, rating_scale=0.6).solve().total_mw
+    reason = plan.closed[21]
+    assert reason.startswith("its smallest size is 40 MW, but the limits leave it at most ")
+    assert alone - 0.01 <= float(reason.split()[-4]) < 40
 
 
 def test_bounds_narrow_the_sizes_of_open_sites(problem: HostingProblem) -> None:
@@ -236,13 +239,15 @@ def test_bounds_are_refused_together(problem: HostingProblem) -> None:
     )
 
 
-def test_rows_that_no_plan_meets_are_named(problem: HostingProblem) -> None:
+def test_rows_that_no_plan_meets_are_named() -> None:
     with pytest.raises(InfeasibleError) as error:
-        problem.solve([Row({21: 1.0}, 1e4, "aggregate loss, fault 22")])
+        HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6).solve(
+            [Row({21: 1.0}, 1e4, "aggregate loss, fault 22")]
+        )
     assert str(error.value) == (
-        "No capacities meet all requirement rows, not even with every site closed. Rows that hold for every "
-        "plan: aggregate loss, fault 22. Ways out: give a row the site that it belongs to, so that the site "
-        "can be closed, or relax its limit."
+        "No capacities meet all requirement rows, not even with every site closed. Missed: "
+        "aggregate loss, fault 22 (9500 short at least). Ways out: give a row the site that it belongs to, "
+        "so that the site can be closed, or relax its limit."
     )
 
 
@@ -282,7 +287,7 @@ def test_base_case_without_enough_units_says_so() -> None:
 
 def test_voltages_outside_the_limits_before_hosting_are_named() -> None:
     with pytest.raises(InfeasibleError) as error:
-        HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06)).solve()
+        HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06), reactive_limits=False).solve()
     lines = str(error.value).splitlines()
     assert lines[0] == "ieee118: with nothing hosted 3 bus(es) are outside the voltage limits 0.95-1.06 pu."
     assert lines[1] == "  bus 53: outside in 14 hours, worst 0.9459 pu in hour 8441"

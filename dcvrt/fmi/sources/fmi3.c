@@ -65,7 +65,7 @@ fmi3Status fmi3ExitInitializationMode(fmi3Instance instance)
 {
     REQUIRE(INITIALIZATION);
     char text[2048];
-    if (!hybrid_gaps(&i->saved.now, text, sizeof text)) return tell(i, fmi3Error, "%s", text);
+    if (!hybrid_together(&i->saved.now, text, sizeof text)) return tell(i, fmi3Error, "%s", text);
     if (refresh(i) != fmi3OK) {
         i->saved.phase = FAILED;
         return fmi3Error;

@@ -68,7 +68,7 @@ bool hybrid_equilibrium(struct hybrid *s, char *message, size_t size);
 void hybrid_equilibrium_slope(const struct hybrid *s, struct direction *d);
 
 /* jumps.c */
-bool hybrid_gaps(const struct hybrid *s, char *message, size_t size);
+bool hybrid_together(const struct hybrid *s, char *message, size_t size);
 void hybrid_begin(struct hybrid *s);
 bool hybrid_active(const struct hybrid *s, int row);
 double hybrid_indicator(const struct hybrid *s, int k);

@@ -9,15 +9,25 @@
 #define SAME_INSTANT 1e-9 /* s: jumps closer than this are at one instant; guards are judged this far ahead */
 #define MAX_JUMPS_AT_ONCE 50
 
-/* Whether the parameters leave hysteresis between every two modes that lead back and forth. */
-bool hybrid_gaps(const struct hybrid *s, char *message, size_t size)
+/* Whether the parameters are in order between them: what is tied to them is in its range, and there is hysteresis
+   between every two modes that lead back and forth. */
+bool hybrid_together(const struct hybrid *s, char *message, size_t size)
 {
-    double values[ROOM(NGAP_VALUES)];
+    double values[ROOM(NTOGETHER)];
     const double *inputs[] = {s->p}, *value = values;
     double *results[] = {values};
-    model_gaps(inputs, results, NULL, NULL, 0);
+    model_together(inputs, results, NULL, NULL, 0);
+    for (int k = 0; k < NTIED; ++k) {
+        const struct tied *tied = &model_tied[k];
+        double found = *value++;
+        if (!(tied->low <= found && found <= tied->high)) {
+            snprintf(message, size, "%s = %g %s is outside [%g, %g].", tied->what, found, tied->unit, tied->low,
+                     tied->high);
+            return false;
+        }
+    }
     for (int k = 0; k < NGAPS; ++k) {
-        const struct gap *gap = &model_gap_table[k];
+        const struct gap *gap = &model_gaps[k];
         double width = *value++;
         if (!(width > 0.0)) {
             size_t used = (size_t)snprintf(message, size, "%s leave no gap between them (", gap->rows);

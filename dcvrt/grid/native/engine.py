@@ -7,22 +7,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.dae import Dae
 from dcvrt.errors import InputError, raise_all
 from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
 from dcvrt.grid.native.point import NativePoint, System, refuse_islands
 from dcvrt.grid.native.run import MOST_DIRECTIONS, Options, Simulated
-from dcvrt.grid.native.steady import directions, loads
+from dcvrt.grid.native.steady import Flow, directions, loads
 from dcvrt.grid.native.structure import SCALE, Structure
 from dcvrt.grid.network import Network
 from dcvrt.grid.period import Period
 from dcvrt.models import Diagram
-from dcvrt.models.machines import setpoints
+from dcvrt.models.machines import UnitBlock, alone, setpoints
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -114,6 +116,9 @@ class Engine:
         Who supplies a change of load, one of `redispatch.RULES`.
     reactive_limits : bool
         Whether units respect their reactive limits in the power flow.
+    load_model, wind_model : UnitBlock, optional
+        What network loads and wind are in a fault, a block for each bus that has any; impedances when not
+        given.
     """
 
     network: Network
@@ -122,19 +127,21 @@ class Engine:
     per_hosted: complex
     rule: str = "proportional"
     reactive_limits: bool = False
+    load_model: UnitBlock | None = None
+    wind_model: UnitBlock | None = None
     options: Options = field(default_factory=Options)
 
     @cached_property
     def system(self) -> System:
         """Units and network, compiled."""
-        return System(self.network, groups(self.units), self.network.indices(self.sites))
+        return System(Flow(self.network), groups(self.units), self.network.indices(self.sites))
 
     def point(
         self,
         hosting: Mapping[int, float],
         period: Period,
         wrt: Sequence[Theta] = (),
-        facilities: Mapping[int, Diagram] | None = None,
+        facilities: Mapping[int, Diagram | Dae] | None = None,
     ) -> NativePoint:
         """Solve and initialise an operating point.
 
@@ -147,47 +154,84 @@ class Engine:
         own = {unit.bus for group in coupled for unit in group.units}
         scale = period.dc_factor * self.per_hosted
         hosted = {bus: 0j if bus in own else scale * hosting.get(bus, 0.0) for bus in self.sites}
-        load = loads(network, hosted, period.wind, period.load_scale)
-        network_load = loads(network, {}, {}, 1.0)
+        own_load, wind = loads(network, {}, {}, period.load_scale), -loads(network, {}, period.wind, 0.0)
         outside = [("", None) if q.kind == "H" and q.bus in own else (q.kind, q.bus) for q in wrt]
-        changes = directions(network, outside, scale, network_load)
+
+        def change(*kinds: str) -> Phasors:
+            kept = [(kind, bus) if kind in kinds else ("", None) for kind, bus in outside]
+            return directions(network, kept, scale, loads(network, {}, {}, 1.0))
+
+        load, changes = loads(network, hosted, {}, 0.0), change("H")
+        fed: dict[str, tuple[Phasors, Phasors]] = {}
+        for kind, model, power, moved in (
+            ("load", self.load_model, -own_load, -change("load")),
+            ("wind", self.wind_model, wind, -change("wind")),
+        ):
+            if model is None:
+                load, changes = load - power, changes - moved
+            else:
+                fed[kind] = power, moved
         sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
         for row, unit in enumerate(unit for group in coupled for unit in group.units):
             sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
-        system = (
-            self.system if not coupled else System(network, self.system.groups, self.system.points, coupled)
-        )
         where = f"{network.name}, {period.name}"
-        return NativePoint(system, load, changes, sizes, self.rule, self.reactive_limits, where)
+        system = self._system(tuple(self._devices(fed)), coupled)
+        return NativePoint(system, load, changes, fed, sizes, self.rule, self.reactive_limits, where)
+
+    def _system(self, devices: tuple[Group, ...], coupled: tuple[Group, ...]) -> System:
+        return self.system.joined_by(devices, coupled) if devices or coupled else self.system
+
+    def _devices(self, fed: Mapping[str, tuple[Phasors, Phasors]]) -> Iterable[Group]:
+        """Loads and wind as units, one at each bus that has any."""
+        for kind, (power, _) in fed.items():
+            model = self.load_model if kind == "load" else self.wind_model
+            assert model is not None
+            if kind not in self._of_devices:
+                dae = alone(model).compile()
+                self._of_devices[kind] = Structure(dae, setpoints=setpoints(dae))
+            structure = self._of_devices[kind]
+            units = [Unit(f"{kind} at bus {bus}", int(bus), {}) for bus in self.network.bus[power != 0]]
+            if units:
+                yield Group(structure, units, kind)
+
+    @cached_property
+    def _of_devices(self) -> dict[str, Structure]:
+        return {}
 
     def _coupled(
-        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram]
+        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram | Dae]
     ) -> tuple[Group, ...]:
         """Facilities as units, those of one diagram together; a site that hosts nothing has none."""
-        by_diagram: dict[int, list[int]] = {}
-        for bus, diagram in facilities.items():
+        alike: dict[int, list[int]] = {}
+        for bus, facility in facilities.items():
             if hosting.get(bus, 0.0) > 0:
-                by_diagram.setdefault(id(diagram), []).append(bus)
+                alike.setdefault(id(facility), []).append(bus)
         pf = float(np.cos(np.angle(self.per_hosted)))
         given = {"H": 1.0, "d": period.dc_factor, "pf": pf}
         made = []
-        for buses in by_diagram.values():
-            diagram = facilities[buses[0]]
-            if diagram not in self._structures:
-                self._structures[diagram] = Structure(diagram.compile(), "v_poi", "i", -1.0, sized=True)
-            structure = self._structures[diagram]
+        for buses in alike.values():
+            facility = facilities[buses[0]]
+            structure = self._structure_of(facility)
             known = {path: value for path, value in given.items() if path in structure.dae.p_names}
             structure.dae.parameter_values(**known)
             units = [
-                Unit(f"facility {diagram.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
+                Unit(f"facility {facility.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
                 for bus in buses
             ]
             made.append(Group(structure, units))
         return tuple(made)
 
+    def _structure_of(self, facility: Diagram | Dae) -> Structure:
+        """What the network sees of a facility; kept for a compiled one, which can't change."""
+        if isinstance(facility, Diagram):
+            return Structure(facility.compile(), "v_poi", "i", -1.0, sized=True)
+        if facility not in self._structures:
+            self._structures[facility] = Structure(facility, "v_poi", "i", -1.0, sized=True)
+        return self._structures[facility]
+
     @cached_property
-    def _structures(self) -> dict[Diagram, Structure]:
-        return {}
+    def _structures(self) -> WeakKeyDictionary[Dae, Structure]:
+        return WeakKeyDictionary()
 
     def simulate(
         self, point: NativePoint, fault: Fault, times: Sequence[Floats], wrt: Sequence[Theta] = ()

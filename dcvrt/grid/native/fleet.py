@@ -49,10 +49,20 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Units of one structure."""
+    """Units of one structure.
+
+    Parameters
+    ----------
+    structure : Structure
+    units : sequence of Unit
+    power : str
+        Whose power at the bus they feed in: that of its `generation`, of its (negative) `load`, of its
+        `wind`.
+    """
 
     structure: Structure
     units: Sequence[Unit]
+    power: str = "generation"
 
     @cached_property
     def p(self) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,7 +37,8 @@ class System:
 
     Parameters
     ----------
-    network : Network
+    flow : Flow
+        Power flow of its network.
     groups : sequence of Group
     points : int array
         Positions of the buses whose voltage is asked for.
@@ -45,20 +46,24 @@ class System:
         Dynamic loads, one unit a site.
     """
 
-    network: Network
+    flow: Flow
     groups: tuple[Group, ...]
     points: Integers
     facilities: tuple[Group, ...] = ()
+
+    def joined_by(self, devices: tuple[Group, ...], facilities: tuple[Group, ...]) -> System:
+        """The same grid with more units."""
+        return replace(self, groups=(*self.groups, *devices), facilities=facilities)
+
+    @property
+    def network(self) -> Network:
+        """Buses, branches and generators."""
+        return self.flow.network
 
     @property
     def all_groups(self) -> tuple[Group, ...]:
         """Generating units, then facilities."""
         return (*self.groups, *self.facilities)
-
-    @cached_property
-    def flow(self) -> Flow:
-        """Power flow of the network."""
-        return Flow(self.network)
 
     @cached_property
     def layout(self) -> Layout:
@@ -92,10 +97,10 @@ class NativePoint:
     Parameters
     ----------
     system : System
-    load : complex array (buses,)
-        All that the buses take but the facilities, pu.
-    dload : complex array (buses, parameters)
-        Its derivatives.
+    load, dload : complex arrays (buses,) and (buses, parameters)
+        What the buses take as impedances, pu, and its derivatives.
+    fed : mapping of `Group.power` to pair of such arrays
+        Power that other units than generators feed in, and its derivatives.
     dscale : array (facilities, parameters)
         Derivatives of the sizes of the facilities, counted through their groups, over the base of the system.
     rule : str
@@ -115,14 +120,17 @@ class NativePoint:
         system: System,
         load: Phasors,
         dload: Phasors,
+        fed: Mapping[str, tuple[Phasors, Phasors]],
         dscale: Floats,
         rule: str,
         reactive_limits: bool,
         where: str,
     ) -> None:
         self.system, self.where, self._load, self._dload = system, where, load, dload
-        fed = self._power_flow(rule, reactive_limits)
-        self._derivatives(fed, dscale)
+        taken = load - sum((power for power, _ in fed.values()), np.zeros_like(load))
+        coupled = self._power_flow(taken, rule, reactive_limits)
+        self._derivatives(dload - sum((d for _, d in fed.values()), np.zeros_like(dload)), coupled, dscale)
+        powers = {**fed, "generation": (self.steady.generation, self._dgeneration)}
         first = 0
         self.rest: list[Equilibrium] = []
         self._dx: list[Floats] = []
@@ -130,14 +138,14 @@ class NativePoint:
         for group in system.groups:
             own = system.unit_bus[first : first + len(group.units)]
             first += len(group.units)
-            current, moved = self._currents(group, own)
+            current, moved = self._currents(group, own, *powers[group.power])
             rest = group.equilibrium(self.v0[own], current, where)
             dx, dset = rest.derivatives(self._dv[own], moved)
             self.rest.append(rest)
             self._dx.append(dx)
             self._dset.append(dset)
         seen = 0
-        for rest in fed:
+        for rest in coupled:
             n = len(rest.group.units)
             own = system.unit_bus[first : first + n]
             first += n
@@ -147,9 +155,9 @@ class NativePoint:
             self._dset.append(dscale[seen : seen + n, None, :])
             seen += n
 
-    def _power_flow(self, rule: str, reactive_limits: bool) -> list[Equilibrium]:
+    def _power_flow(self, load: Phasors, rule: str, reactive_limits: bool) -> list[Equilibrium]:
         """Solve it with the power that the facilities draw at rest at the voltages that it gives."""
-        system, load = self.system, self._load
+        system = self.system
         at = system.unit_bus[sum(len(g.units) for g in system.groups) :]
         v = np.ones(len(load), dtype=complex)
         drawn = np.zeros(len(at), dtype=complex)
@@ -180,7 +188,7 @@ class NativePoint:
         ends = np.cumsum([0, *(len(rest.group.units) for rest in fed)])
         return [(at[a:b], rest) for a, b, rest in zip(ends, ends[1:], fed, strict=False)]
 
-    def _derivatives(self, fed: Sequence[Equilibrium], dscale: Floats) -> None:
+    def _derivatives(self, taken: Phasors, fed: Sequence[Equilibrium], dscale: Floats) -> None:
         """Derivatives of voltages and generation; what facilities draw follows the voltage."""
         d = self._dload.shape[1]
         self._dv = self._dgeneration = np.zeros((len(self.v0), d), dtype=complex)
@@ -189,7 +197,7 @@ class NativePoint:
         at = self.system.unit_bus[sum(len(g.units) for g in self.system.groups) :]
         scale = np.concatenate([*(r.p[:, r.group.structure.column(SCALE)] for r in fed), np.zeros(0)])
         for _ in range(ROUNDS):
-            dload, before = self._dload.copy(), self._dv
+            dload, before = taken.copy(), self._dv
             first = 0
             for own, rest in self._at(fed, at):
                 v, dv, i = self.v0[own, None], before[own], rest.current[:, None]
@@ -204,11 +212,11 @@ class NativePoint:
             f"{self.where}: derivatives of the power flow did not settle. Way out: host less."
         )
 
-    def _currents(self, group: Group, at: Integers) -> tuple[Phasors, Phasors]:
-        """Current of each unit into the network, from its part of the generation at its bus."""
+    def _currents(self, group: Group, at: Integers, fed: Phasors, dfed: Phasors) -> tuple[Phasors, Phasors]:
+        """Current of each unit into the network, from its part of the power that is fed in at its bus."""
         v, dv = self.steady.v[at], self._dv[at]
         p, q = (np.array([getattr(u, f"share_{x}") for u in group.units]) for x in "pq")
-        power, moved = self.steady.generation[at], self._dgeneration[at]
+        power, moved = fed[at], dfed[at]
         s = p * power.real + 1j * q * power.imag
         ds = p[:, None] * moved.real + 1j * q[:, None] * moved.imag
         current = (s / v).conj()

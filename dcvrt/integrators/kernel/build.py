@@ -25,6 +25,7 @@ UNITS = {
 #include "loop.c"
 #include "again.c"
 #include "single.c"
+#include "corners.c"
 #include "rest.c"
 """,
     "functionals.c": "",

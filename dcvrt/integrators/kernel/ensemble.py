@@ -19,13 +19,10 @@ from dcvrt.integrators.kernel.library import (
     FunctionalResults,
     InputTable,
     Options,
-    Task,
     Work,
-    doubles,
     view,
 )
 from dcvrt.integrators.kernel.run import KernelModel
-from dcvrt.trajectory import Event
 
 Array = NDArray[np.float64]
 SHARE_OF_A_THREAD = 4
@@ -56,10 +53,11 @@ class Ensemble:
         self.inputs = list(inputs)
         self.P, self.X, self.Z = (np.ascontiguousarray(a, dtype=float) for a in (P, X, Z))
         self.table = functionals if functionals is not None and len(functionals) else None
-        self.tasks = (Task * self.cases)()
-        for k, task in enumerate(self.tasks):
-            task.p, task.x, task.z = (doubles(a[k]) for a in (self.P, self.X, self.Z))
-            task.inputs = ctypes.pointer(self.inputs[k].struct)
+        #: `struct task` of every case: addresses of its p, x, z and inputs
+        self.tasks = np.zeros((self.cases, 4), dtype=np.uintp)
+        for column, a in enumerate((self.P, self.X, self.Z)):
+            self.tasks[:, column] = a.ctypes.data + np.arange(self.cases, dtype=np.uintp) * a.strides[0]
+        self.tasks[:, 3] = [addressof(table.struct) for table in self.inputs]
         self.results = (model.library.Result * self.cases)()
         self.found: Results | None = (
             self.table.results(self.cases, model.equations.nw) if self.table else None
@@ -78,11 +76,11 @@ class Ensemble:
         else:
             with ThreadPoolExecutor(threads) as pool:
                 done = list(pool.map(lambda piece: self._piece(options, *piece), pieces))
-        self.events: list[tuple[Event, ...]] = []
-        for result in self.results:
-            self.events.append(
-                model.events(view(result.event, result.events, model.event_width)) if all(done) else ()
-            )
+        #: the driver's rows of numbers, per case
+        self.events = [
+            view(r.event, r.events, model.event_width).copy() if all(done) else np.zeros((0, 0))
+            for r in self.results
+        ]
         model.library.dll.results_free(byref(self.results), self.cases)
         if not all(done):
             raise MemoryError
@@ -90,7 +88,7 @@ class Ensemble:
     def _piece(self, options: Options, first: int, last: int) -> bool:
         """Run some of the cases; the interpreter is free meanwhile."""
         work = Work()
-        work.task = addressof(self.tasks) + first * sizeof(Task)
+        work.task = self.tasks[first:].ctypes.data
         work.options = ctypes.pointer(options)
         work.result = addressof(self.results) + first * sizeof(self.model.library.Result)
         work.cases = last - first
@@ -106,12 +104,13 @@ class Ensemble:
 
     def status(self, case: int) -> str:
         """How a case ended."""
-        return self.model.sentence(self.results[case], self.events[case])
+        result = self.results[case]
+        return self.model.sentence(result, self.model.events(self.events[case]) if result.status else ())
 
     def sequence(self, case: int) -> tuple[str, ...]:
         """Modes visited, as :attr:`Trajectory.sequence`."""
-        begin = tuple(f"{a.path}: {a.start}" for a in self.model.equations.dae.automata)
-        return begin + tuple(f"{e.automaton}: {e.source} -> {e.target} [{e.row}]" for e in self.events[case])
+        texts, rows = self.model.row_texts, self.events[case][:, 1].astype(int).tolist()
+        return (*self.model.start_texts, *(texts[row] for row in rows))
 
     def outcomes(self, case: int) -> Mapping[str, Outcome]:
         """Functionals of a completed case."""

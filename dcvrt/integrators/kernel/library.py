@@ -47,8 +47,8 @@ class Record(Structure):
 
     _fields_ = (
         *((n, c_long) for n in ("samples", "steps", "nodes", "events", "phases", "breaks")),
-        *((f"{n}_room", c_long) for n in ("sample", "step", "node", "event", "phase", "break")),
-        *((n, DOUBLES) for n in ("sample_t", "sample_x", "sample_z")),
+        *((f"{n}_room", c_long) for n in ("sample", "output", "step", "node", "event", "phase", "break")),
+        *((n, DOUBLES) for n in ("sample_t", "sample_x", "sample_z", "sample_y", "sample_rate")),
         *((n, LONGS) for n in ("sample_piece", "sample_phase", "sample_step")),
         *((n, DOUBLES) for n in ("step_t", "step_h", "step_x")),
         *((n, LONGS) for n in ("step_piece", "step_phase")),
@@ -57,6 +57,12 @@ class Record(Structure):
         ("node_kind", BYTES), ("event", DOUBLES), ("phase", c_void_p), ("dbreak", DOUBLES),
         ("break_kind", BYTES),
     )  # fmt: skip
+
+
+class Corners(Structure):
+    """struct corners."""
+
+    _fields_ = (("missed", c_double), ("sharper", c_double), ("parts", c_int), ("levels", c_int))
 
 
 class FunctionalResults(Structure):
@@ -112,8 +118,7 @@ class Library:
         dll.keep_states.restype = None
         dll.keep_states.argtypes = [c_void_p, c_long, *[c_void_p] * 4]
         dll.outputs_on.argtypes = [c_void_p, c_void_p, c_long, *[c_void_p] * 9]
-        dll.corners_at.argtypes = [c_long, *[c_void_p] * 4, c_double, c_double, c_void_p]
-        dll.corners_at.restype = c_long
+        dll.keep_samples.argtypes = [c_void_p] * 3
         dll.rests_of.argtypes = [c_long, *[c_void_p] * 6]
         dll.rests_of.restype = None
         dll.run_one_lane.argtypes = dll.run_many_lanes.argtypes = [c_void_p]

@@ -271,6 +271,7 @@ class ModelText:
             "bound_sign": [s for _, s, _ in eq.bounds],
             "bound_value": [b for _, _, b in eq.bounds],
             "direction_scale": [eq.columns[k].scale for k in self.directions],
+            "theta_scale": [column.scale for column in eq.columns],
         }
         lines += [_table("int", n, [str(v) for v in values]) for n, values in integers.items()]
         lines += [_table("double", n, [literal(v) for v in values]) for n, values in numbers.items()]

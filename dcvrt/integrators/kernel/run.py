@@ -5,20 +5,27 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from ctypes import byref
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dcvrt.integrators import sentences
-from dcvrt.integrators.channels import Channels
 from dcvrt.integrators.compiler import Compiler
 from dcvrt.integrators.corners import LEVELS, MISSED, POINTS, SHARPER
 from dcvrt.integrators.equations import Equations
 from dcvrt.integrators.kernel import Kernel
 from dcvrt.integrators.kernel.build import build_object
-from dcvrt.integrators.kernel.library import InputTable, Library, Options, Record, Task, doubles, view
+from dcvrt.integrators.kernel.library import (
+    Corners,
+    InputTable,
+    Library,
+    Options,
+    Record,
+    Task,
+    doubles,
+    view,
+)
 from dcvrt.integrators.kernel.model import ModelText
 from dcvrt.trajectory import COMPLETED, Event, Signals, Trajectory
 
@@ -54,6 +61,10 @@ class KernelModel:
         self.width = eq.nx * (1 + eq.nw)
         self.event_width = 2 + len(eq.rows) + eq.nw
         self.has_guards = bool(eq.rows or eq.bounds)
+        automata = eq.dae.automata
+        self.start_texts = tuple(f"{a.path}: {a.start}" for a in automata)
+        self.row_texts = tuple(f"{automata[a].path}: {r.source} -> {r.target} [{r.text}]" for a, r in eq.rows)
+        """What a sequence of modes begins with, and what each row adds to it."""
         self.places: list[int] = []  # memory of finished runs, for the next ones
 
     def __del__(self) -> None:
@@ -85,20 +96,22 @@ class KernelModel:
         self.library.dll.rests_of(n, *(a.ctypes.data for a in (*given, X, Z, found)))
         return X, Z, found.astype(bool)
 
-    def run(self, channels: Channels, p: Array, X: Array, Z: Array, save_at: float) -> KernelRun:
+    def run(self, inputs: InputTable, p: Array, X: Array, Z: Array, save_at: float) -> KernelRun:
         """Run one case."""
-        return KernelRun(self, channels, p, X, Z, save_at)
+        return KernelRun(self, inputs, p, X, Z, save_at)
 
     def events(self, rows: Array) -> tuple[Event, ...]:
         """Event objects from the driver's rows of numbers."""
-        eq = self.equations
-        automata, n = eq.dae.automata, len(eq.rows)
-        made = []
-        for numbers in rows.tolist():
+        eq, n, made = self.equations, len(self.equations.rows), []
+        names, scale = [c.name for c in eq.columns], np.append(np.ones(2 + n), eq.scale)
+        for numbers in (rows / scale + 0.0).tolist():
             a, row = eq.rows[int(numbers[1])]
-            tie = tuple(eq.rows[k][1].text for k in range(n) if numbers[2 + k])
-            grad = {c.name: g / c.scale + 0.0 for c, g in zip(eq.columns, numbers[2 + n :], strict=True)}
-            made.append(Event(numbers[0], automata[a].path, row.source, row.target, row.text, tie, grad))
+            tie: tuple[str, ...] = ()
+            if any(numbers[2 : 2 + n]):
+                tie = tuple(eq.rows[k][1].text for k in range(n) if numbers[2 + k])
+            grad = dict(zip(names, numbers[2 + n :], strict=True))
+            path = eq.dae.automata[a].path
+            made.append(Event(numbers[0], path, row.source, row.target, row.text, tie, grad))
         return tuple(made)
 
     def sentence(self, result: Any, events: Sequence[Event]) -> str:
@@ -130,12 +143,12 @@ class KernelRun:
     """One case, run; it stays in the driver's memory so that steps can be evaluated again."""
 
     def __init__(
-        self, model: KernelModel, channels: Channels, p: Array, X: Array, Z: Array, save_at: float
+        self, model: KernelModel, inputs: InputTable, p: Array, X: Array, Z: Array, save_at: float
     ) -> None:
         self.model = model
         self.p = np.ascontiguousarray(p, dtype=float)
         X, Z = (np.ascontiguousarray(a, dtype=float) for a in (X, Z))
-        self.inputs = InputTable(model.equations, channels)
+        self.inputs = inputs
         self.task = Task(doubles(self.p), doubles(X), doubles(Z), ctypes.pointer(self.inputs.struct))
         options = model.options(save_at, True)
         dll = model.library.dll
@@ -190,63 +203,28 @@ class KernelRun:
             raise MemoryError
         return results
 
-    def corners(self, samples: Samples) -> NDArray[np.int64]:
-        """Intervals in which some output turns a corner that the cubic between two samples misses."""
-        found = np.zeros(len(samples.t), dtype=ctypes.c_long)
-        given = (samples.t, samples.y, samples.rate, samples.phase)
-        count = self.model.library.dll.corners_at(
-            len(found), *(a.ctypes.data for a in given), MISSED, SHARPER, found.ctypes.data
-        )
-        return found[:count]
-
-    def samples(self) -> Samples:
-        """Samples of the run, with more of them at corners of the outputs."""
-        r, width, nz = self.record, self.model.width, self.model.equations.nz
-        n = r.samples
-        t, x = view(r.sample_t, n), view(r.sample_x, n, width)
-        z = view(r.sample_z, n, nz * (1 + self.model.equations.nw))
-        piece, phase, step = (view(p, n) for p in (r.sample_piece, r.sample_phase, r.sample_step))
-        y, rate = self.outputs(t, x, z, piece, phase)
-        samples = Samples(t, piece, phase, step, y, rate, ((x, z),), np.arange(n))
-        for _ in range(LEVELS):
-            at = self.corners(samples)
-            if not len(at):
-                break
-            samples = samples.with_more(at, self._between(samples, at))
-        return samples
-
-    def _between(self, s: Samples, at: NDArray[np.int64]) -> Samples:
-        """More samples strictly inside some intervals."""
-        inside = POINTS - 1
-        t = (s.t[at][:, None] + (s.t[at + 1] - s.t[at])[:, None] * np.arange(1, POINTS) / POINTS).ravel()
-        step, phase = np.repeat(s.step[at + 1], inside), np.repeat(s.phase[at + 1], inside)
-        x, z = self.states(t, step)
-        low, high = np.repeat(s.piece[at], inside), np.repeat(s.piece[at + 1], inside)
-        piece = np.clip(np.searchsorted(self.inputs.start, t, side="right") - 1, low, high)
-        y, rate = self.outputs(t, x, z, piece, phase)
-        return Samples(t, piece, phase, step, y, rate, ((x, z),), np.arange(len(t)))
-
     def trajectory(self, wrt: tuple[str, ...], name: str) -> Trajectory:
         """Signals on the samples, with samples added at corners of the outputs."""
         eq, r = self.model.equations, self.record
-        dae, samples = eq.dae, self.samples()
-        n = len(samples.t)
-        x, z = samples.assembled()
+        corners = Corners(MISSED, SHARPER, POINTS, LEVELS)
+        if not self.model.library.dll.keep_samples(self.keep, byref(corners), byref(r)):
+            raise MemoryError
+        dae, n, ny = eq.dae, r.samples, eq.dae.y.numel()
+        t = view(r.sample_t, n).copy()
+        y, rate = (view(a, n, ny).copy() for a in (r.sample_y, r.sample_rate))
+        x, z = view(r.sample_x, n, self.model.width), view(r.sample_z, n, eq.nz * (1 + eq.nw))
         sens = rate_sens = x_sens = z_sens = None
         if eq.nw:
-            _, _, sens, rate_sens = self.outputs(samples.t, x, z, samples.piece, samples.phase, True)
-            sens /= eq.scale
-            rate_sens /= eq.scale
-            x[:, eq.nx :] /= np.repeat(eq.scale, eq.nx)
-            z[:, eq.nz :] /= np.repeat(eq.scale, eq.nz)
-            x_sens = x[:, eq.nx :].reshape(n, eq.nw, eq.nx).transpose(0, 2, 1)
-            z_sens = z[:, eq.nz :].reshape(n, eq.nw, eq.nz).transpose(0, 2, 1)
+            piece, phase = view(r.sample_piece, n), view(r.sample_phase, n)
+            _, _, sens, rate_sens = self.outputs(t, x, z, piece, phase, True)
+            x_sens = _by_theta(x, eq.nx, eq.scale)
+            z_sens = _by_theta(z, eq.nz, eq.scale)
         breaks = view(r.dbreak, r.breaks, eq.nw) / (eq.scale if eq.nw else 1.0)
         return Trajectory(
-            t=samples.t.copy(),
-            outputs=Signals(dae.y_names, samples.y, samples.rate, sens, rate_sens),
-            states=Signals(dae.x_names, x[:, : eq.nx], None, x_sens),
-            algebraics=Signals(tuple(row.path for row in dae.algebraics), z[:, : eq.nz], None, z_sens),
+            t=t,
+            outputs=Signals(dae.y_names, y, rate, sens, rate_sens),
+            states=Signals(dae.x_names, x[:, : eq.nx].copy(), None, x_sens),
+            algebraics=Signals(dae.z_names, z[:, : eq.nz].copy(), None, z_sens),
             events=self.events,
             status=self.status,
             parameters=dict(zip(dae.p_names, self.p.tolist(), strict=True)),
@@ -257,53 +235,8 @@ class KernelRun:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Samples in order of time; states stay where they were computed until all samples are there.
-
-    Attributes
-    ----------
-    t, piece, phase, step : time of each sample, piece of the inputs, phase of the modes, step of the run.
-    y, rate : outputs and their rates.
-    stores : states and algebraic variables, in the order in which they were computed.
-    order : number of each sample in that order.
-    """
-
-    t: Array
-    piece: NDArray[np.int64]
-    phase: NDArray[np.int64]
-    step: NDArray[np.int64]
-    y: Array
-    rate: Array
-    stores: tuple[tuple[Array, Array], ...]
-    order: NDArray[np.int64]
-
-    def with_more(self, at: NDArray[np.int64], new: Samples) -> Samples:
-        """These and new samples inside the intervals `at`, equally many in each."""
-        place = np.repeat(at + 1, len(new.t) // len(at))
-
-        def merged(old: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
-            return np.insert(old, place, more, axis=0)
-
-        return Samples(
-            merged(self.t, new.t),
-            merged(self.piece, new.piece),
-            merged(self.phase, new.phase),
-            merged(self.step, new.step),
-            merged(self.y, new.y),
-            merged(self.rate, new.rate),
-            self.stores + new.stores,
-            merged(self.order, len(self.t) + new.order),
-        )
-
-    def assembled(self) -> list[Array]:
-        """States and algebraic variables in order, for the caller to keep."""
-        whole = [np.empty((len(self.t), a.shape[1])) for a in self.stores[0]]
-        begin = 0
-        for store in self.stores:
-            end = begin + len(store[0])
-            rows = np.flatnonzero((self.order >= begin) & (self.order < end))
-            for into, part in zip(whole, store, strict=True):
-                into[rows] = part
-            begin = end
-        return whole
+def _by_theta(flat: Array, rows: int, scale: Array) -> Array:
+    """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors."""
+    n = len(flat)
+    scaled = flat[:, rows:].reshape(n, len(scale), rows).transpose(0, 2, 1)
+    return np.ascontiguousarray(scaled) / scale

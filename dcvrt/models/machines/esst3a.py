@@ -161,7 +161,7 @@ def rectifier(load: Any) -> Any:
     """Output of a rectifier over its voltage, as its normalised current grows.
 
     >>> [round(float(rectifier(load)), 3) for load in (-0.1, 0.2, 0.6, 0.9, 1.2)]
-    [1.0, 0.885, 0.624, 0.173, 0.0]
+    [1.0, 0.885, 0.625, 0.173, 0.0]
     """
     first, second = 0.433, 0.75
     slow = ca.fmin(ca.fmax(load, 0.0), first)

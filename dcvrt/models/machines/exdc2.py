@@ -12,6 +12,7 @@ from dcvrt.models.machines.parts import (
     UnitBlock,
     lag_rows,
     lag_side,
+    lag_value,
     lead_lag,
     magnitude,
     saturation,
@@ -86,6 +87,14 @@ class Exdc2(UnitBlock):
     e_f = State(1.0, "pu(V)", "voltage of the exciter at nominal speed", time="T_E")
     w = State(1.0, "pu(V)", "state of the rate feedback", time="T_F")
 
+    def limits(self, s: Any) -> tuple[Any, Any]:
+        """Limits of the regulator, lower one first."""
+        return s.V_Rmin, s.V_Rmax
+
+    def output_of_regulator(self, s: Any) -> Any:
+        """What the regulator gives."""
+        return s.v_r
+
     def field(self, s: Any) -> Any:
         """Field voltage of the machine."""
         return s.omega * s.e_f
@@ -97,7 +106,7 @@ class Exdc2(UnitBlock):
 
     def equations(self, s: Any) -> Equations:
         u, asked = self._asked(s)
-        side = lag_side(s, s.v_r, asked, s.V_Rmin, s.V_Rmax, self.is_off("T_A"))
+        side = lag_side(s, s.v_r, asked, *self.limits(s), self.is_off("T_A"))
         loss = s.K_E * s.e_f
         if not self.is_off("S_B"):
             loss = loss + saturation(s.e_f, s.S_A, s.S_B)
@@ -106,7 +115,7 @@ class Exdc2(UnitBlock):
                 v_m=magnitude(s.v) - s.v_m,
                 x=u - s.x,
                 v_r=side,
-                e_f=s.v_r - loss,
+                e_f=self.output_of_regulator(s) - loss,
                 w=s.e_f - s.w,
             ),
             out=dict(v_f=self.field(s)),
@@ -114,14 +123,14 @@ class Exdc2(UnitBlock):
 
     def transitions(self, s: Any) -> tuple[Go, ...]:
         _, asked = self._asked(s)
-        return lag_rows("v_r", s.v_r, asked, s.V_Rmin, s.V_Rmax, self.is_off("T_A"))
+        return lag_rows("v_r", s.v_r, asked, *self.limits(s), self.is_off("T_A"))
 
     def rest(self, s: Any) -> dict[str, Any]:
         return dict(v_m=magnitude(s.v), w=s.e_f, x=s.v_ref + s.v_s - magnitude(s.v))
 
 
 class Ieeex1(Exdc2):
-    r"""Excitation system of type 1 with a direct-current exciter, IEEEX1: EXDC2 without its factor of speed.
+    r"""Excitation system of type 1 with a lead-lag, IEEEX1.
 
     .. math::
         T_R \dot v_m = |v| - v_m, \qquad u = V_{ref} + V_s - v_m - \frac{K_F}{T_F} (V_f - w), \qquad
@@ -134,18 +143,42 @@ class Ieeex1(Exdc2):
     .. math::
         T_E \dot V_f = v_r - K_E V_f - S_B [V_f - S_A]_+^2, \qquad T_F \dot w = V_f - w
 
-    | mode | output of the regulator |
-    |---|---|
-    | FREE | follows the lag |
-    | UPPER | V_Rmax, while more is asked for |
-    | LOWER | V_Rmin, while less is asked for |
-
-    ANDES documents limits that fall with the terminal voltage; its limiter keeps the constants all the same
-    (version 2.0), and so does this block: one case gives one answer.
-    Time constants of 0 as in EXDC2.
+    Modes and time constants of 0 as in EXDC2, from which it differs in that V_f does not follow the speed.
+    Valid for direct-current exciters whose regulator has a supply of its own.
     Equilibrium: v_m = |v|, w = V_f, v_r = K_E V_f + S_B [V_f - S_A]^2, x = v_r / K_A, V_ref = |v| + x.
-    Source: PSS/E's IEEEX1 as ANDES computes it.
+    Source: PSS/E's IEEEX1, and ANDES's as it computes: it declares limits that move with the voltage, and
+    runs with fixed ones. `Ieeex1BusFed` has those that move.
     """
 
     def field(self, s: Any) -> Any:
         return s.e_f
+
+
+class Ieeex1BusFed(Ieeex1):
+    r"""IEEEX1 whose limits are in proportion to the terminal voltage, which feeds its regulator.
+
+    .. math::
+        T_A \dot v_r = K_A \Bigl(x + \frac{T_C}{T_B} (u - x)\Bigr) - v_r, \qquad
+        V_{Rmin} |v| \le v_r \le V_{Rmax} |v|
+
+    | mode | output of the regulator |
+    |---|---|
+    | FREE | follows the lag |
+    | UPPER | V_Rmax times the voltage, while more is asked for |
+    | LOWER | V_Rmin times the voltage, while less is asked for |
+
+    All else as in IEEEX1. On a limit the output moves with it, and the lag starts from where the limit is
+    when it lets go; the state v_r means nothing meanwhile. A limit that rises at a stroke, as a fault is
+    cleared, takes the output with it; a lag that had to catch up first would need a fraction of T_A, as long
+    as what is asked for is far beyond the limit.
+    Valid for direct-current exciters whose regulator is fed from the terminals.
+    Equilibrium: as IEEEX1.
+    Source: IEEE Std 421.5, the limits of type DC2A.
+    """
+
+    def limits(self, s: Any) -> tuple[Any, Any]:
+        size = magnitude(s.v)
+        return s.V_Rmin * size, s.V_Rmax * size
+
+    def output_of_regulator(self, s: Any) -> Any:
+        return lag_value(s, s.v_r, *self.limits(s), self.is_off("T_A"))

@@ -27,14 +27,14 @@ class GenCls(UnitBlock):
     Source: P. Kundur, Power System Stability and Control, ch. 12; ANDES's GENCLS.
     """
 
-    M = Parameter(8.0, "s", (1e-3, 1e5), "start-up time, 2H, on the common base", "illustrative: H = 4 s")
-    D = Parameter(0.0, "1", (0.0, 1e5), "damping: torque over speed", "default of ANDES's GENCLS")
+    M = Parameter(8.0, "s", (1e-3, 1e9), "start-up time, 2H, on the common base", "illustrative: H = 4 s")
+    D = Parameter(0.0, "1", (0.0, 1e9), "damping: torque over speed", "default of ANDES's GENCLS")
     f_B = Parameter(60.0, "Hz", (45.0, 65.0), "nominal frequency", "North American grid")
     r_a = Parameter(
         0.0, "pu(V)/pu(I)", (0.0, 100.0), "resistance of the armature", "default of ANDES's GENCLS"
     )
     x_d1 = Parameter(
-        0.302, "pu(V)/pu(I)", (1e-6, 100.0), "transient reactance x_d'", "default of ANDES's GENCLS"
+        0.302, "pu(V)/pu(I)", (1e-12, 100.0), "transient reactance x_d'", "default of ANDES's GENCLS"
     )
 
     v = Input("pu(V)", "terminal voltage, network frame", kind=Phasor)

@@ -6,7 +6,7 @@ from typing import Any
 
 from dcvrt.models.automaton import Go, above, below
 from dcvrt.models.block import Equations, Input, Output, Parameter, State
-from dcvrt.models.machines.parts import CLIPPED, UnitBlock, lead_lag
+from dcvrt.models.machines.parts import CLIPPED, RELEASE, UnitBlock, lead_lag
 
 ANDES = "default of ANDES's IEEEG1"
 
@@ -109,8 +109,8 @@ class Ieeeg1(UnitBlock):
             Go("FREE", "CLOSING", below(rate, s.U_c), settles=CLIPPED),
             Go("OPENING", "FREE", below(rate, s.U_o), settles=CLIPPED),
             Go("CLOSING", "FREE", above(rate, s.U_c), settles=CLIPPED),
-            Go("FULL", "FREE", below(rate, 0.0)),
-            Go("SHUT", "FREE", above(rate, 0.0)),
+            Go("FULL", "FREE", below(rate, -RELEASE)),
+            Go("SHUT", "FREE", above(rate, RELEASE)),
         )
 
     def rest(self, s: Any) -> dict[str, Any]:

@@ -147,15 +147,15 @@ class Ieeest(UnitBlock):
     def _signals(self, s: Any) -> tuple[dict[str, Any], Any]:
         """Right sides, and the output before its limits."""
         u = signal_of(s, self.values["signal"])
+        y = u if "y_1" in self.lagless() else s.y_1
         if not self.is_off("A_2"):
             der = dict(r_1=(u - s.y_1 - s.A_1 * s.r_1) / s.A_2, y_1=s.r_1)
         else:
             der = dict(r_1=-s.r_1, y_1=u - s.y_1 if self.is_off("A_1") else (u - s.y_1) / s.A_1)
         if self.is_off("A_4"):
             der |= dict(r_2=-s.r_2, y_2=-s.y_2)
-            y = s.y_1
         else:
-            bend = (s.y_1 - s.y_2 - s.A_3 * s.r_2) / s.A_4
+            bend = (y - s.y_2 - s.A_3 * s.r_2) / s.A_4
             der |= dict(r_2=bend, y_2=s.r_2)
             y = s.y_2 + s.A_5 * s.r_2 + s.A_6 * bend
         der["x_1"] = y - s.x_1

@@ -29,6 +29,7 @@ class UnitBlock(Block):
     Time constants need not be named here: 0 always leaves out their state.
     """
 
+    optional_terms: ClassVar[bool] = True
     optional: ClassVar[tuple[str, ...]] = ()
     switches: ClassVar[tuple[str, ...]] = ()
     ordered: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -85,6 +86,9 @@ def lead_lag(u: Scalar, x: Scalar, T_lead: Scalar, T_lag: Scalar, passes: bool) 
 
 LIMITED = ("FREE", "UPPER", "LOWER")
 LIMIT_FLAGS = {"free": (1, 0, 0), "upper": (0, 1, 0), "lower": (0, 0, 1)}
+RELEASE = 1e-9
+"""By how much the target must be inside a limit for a state to leave it, pu: above round-off, below accuracy.
+At the instant of release the state is on the limit and the rate 0: else its last bit would decide."""
 CLIPPED = (
     "a limited signal is continuous over its limit, so that whatever drives it crosses with one and the same "
     "rate before and after"
@@ -108,6 +112,11 @@ def lag_rows(
     return clip_rows(target, low, high) if at_once else windup_rows(state, x, target, low, high)
 
 
+def lag_value(s: Any, x: Scalar, low: Scalar, high: Scalar, at_once: bool) -> Scalar:
+    """What a lag gives whose limits move: its state, or the limit as it is now."""
+    return x if at_once else limited(s, x, low, high)
+
+
 def clip_rows(signal: Scalar, low: Scalar, high: Scalar) -> tuple[Go, ...]:
     """Rows of a signal without memory that is cut off at two limits."""
     return (
@@ -122,14 +131,14 @@ def windup_rows(state: str, x: Scalar, target: Scalar, low: Scalar, high: Scalar
     """Rows of a lag T dx/dt = target - x that stops on its limits.
 
     It enters a limit when it is beyond it and still moves outwards, and is put on it; it leaves once the
-    rate turns inwards, and starts from the limit as it is then. No gap is needed: to come back
-    the rate must first turn outwards again.
+    rate turns inwards, and starts from the limit as it is then. To come back the rate must first turn
+    outwards again, by `RELEASE`, so that it cannot chatter.
     """
     return (
         Go("FREE", "UPPER", above(x, high) & above(target - x, 0.0), reset={state: high}),
         Go("FREE", "LOWER", below(x, low) & below(target - x, 0.0), reset={state: low}),
-        Go("UPPER", "FREE", below(target - high, 0.0), reset={state: high}),
-        Go("LOWER", "FREE", above(target - low, 0.0), reset={state: low}),
+        Go("UPPER", "FREE", below(target - high, -RELEASE), reset={state: high}),
+        Go("LOWER", "FREE", above(target - low, RELEASE), reset={state: low}),
     )
 
 

@@ -15,8 +15,8 @@ from dcvrt.models.machines.parts import UnitBlock
 from dcvrt.models.netlist import netlist
 from dcvrt.models.phasor import Phasor
 
-FIELD = ("exciter.v_ref", "exciter.regulator.v_ref", "exciter.v_f0")
-POWER = ("governor.p_ref",)
+FIELD = ("exciter.v_ref", "exciter.regulator.v_ref", "exciter.v_f0", "device.p_0")
+POWER = ("governor.p_ref", "device.q_0")
 
 
 def unit(
@@ -86,8 +86,23 @@ def unit(
     return d
 
 
+def alone(block: UnitBlock) -> Diagram:
+    """A block that is a unit by itself, at `device`: a load, a converter.
+
+    >>> from dcvrt.models.machines import ZipLoad, setpoints
+    >>> setpoints(alone(ZipLoad(a_z=0.4)).compile())
+    ('device.p_0', 'device.q_0')
+    """
+    d = Diagram(block.label)
+    device = d.add("device", block)
+    d.connect(d.input("v", "pu(V)", Phasor, doc="terminal voltage, network frame"), device.v)
+    d.output("i", device.i)
+    return d
+
+
 def setpoints(dae: Dae) -> tuple[str, str]:
-    """Paths of the two parameters of a unit that the power flow decides: of the field, and of the power.
+    """Paths of the two parameters of a unit that the power flow decides: of the field, and of the power; of
+    a load or converter its two powers.
 
     Raises
     ------

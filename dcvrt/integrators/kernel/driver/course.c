@@ -128,6 +128,8 @@ static struct cubic cubic_through(double step, double a, double da, double b, do
 
 static double cubic_at(const struct cubic *k, double s) { return k->a + s * (k->c1 + s * (k->c2 + s * k->c3)); }
 
+static double cubic_slope(const struct cubic *k, double s) { return k->c1 + s * (2 * k->c2 + 3 * s * k->c3); }
+
 /* -- modes -------------------------------------------------------------------------------------------- */
 
 void course_fixed(const double *p, const int *mode, const double *dentry, double *m, double *mc)
@@ -495,26 +497,32 @@ int course_move(struct course *c, double t, const double *x, const double *z)
     return next_limit(c);
 }
 
-/* Whether a step to t1 has seen its inputs: where it spans whole pieces, they must stay near the cubic through
- * their values and rates at its ends, or stages may lie on either side of a pulse. */
-int course_inputs_seen(struct course *c, double t1)
+/* What the inputs do on a step to t1, by how far they are at the knots inside off the cubic through their values
+ * and rates at its ends. A step that spans whole pieces must stay near it, or stages may lie on either side of a
+ * pulse. */
+enum seen course_inputs(struct course *c, double t1)
 {
     const struct inputs *in = c->task->inputs;
     long last = last_piece(c), knot = c->piece + 1;
     while (knot <= last && in->start[knot] <= c->t) knot++;
-    if (knot + 1 > last || in->start[knot + 1] >= t1) return 1; /* at most one knot inside */
     struct spot a, b, s;
+    struct cubic cubic[AT_LEAST_ONE(NU)];
     double h = t1 - c->t, near = 100 * (c->options->rtol + c->options->atol);
+    double smooth = ONE_CUBIC * c->options->watch_tolerance, off = 0, off_rate = 0;
+    int spans_pieces = knot + 1 <= last && in->start[knot + 1] < t1;
     inputs_at(in, piece_at(in, c->piece, 0, last, c->t), c->t, &a);
     inputs_at(in, piece_at(in, c->piece, 0, last, t1), t1, &b);
+    for (int k = 0; k < NU; k++) cubic[k] = cubic_through(h, a.u[k], a.v[k], b.u[k], b.v[k]);
     for (; knot <= last && in->start[knot] < t1; knot++) {
+        double at = (in->start[knot] - c->t) / h;
         inputs_at(in, knot, in->start[knot], &s);
         for (int k = 0; k < NU; k++) {
-            struct cubic cubic = cubic_through(h, a.u[k], a.v[k], b.u[k], b.v[k]);
-            if (!(fabs(s.u[k] - cubic_at(&cubic, (in->start[knot] - c->t) / h)) <= near)) return 0;
+            off = higher(fabs(s.u[k] - cubic_at(cubic + k, at)), off);
+            off_rate = higher(fabs(s.v[k] * h - cubic_slope(cubic + k, at)), off_rate);
         }
+        if (spans_pieces && !(off <= near)) return INPUTS_UNSEEN;
     }
-    return 1;
+    return off <= smooth && off_rate <= smooth ? INPUTS_ONE_CUBIC : INPUTS_SEEN;
 }
 
 /* -- events on guards --------------------------------------------------------------------------------- */

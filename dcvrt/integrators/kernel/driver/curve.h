@@ -160,7 +160,7 @@ static void add_extrema(struct curve *c, long k, double h, double y0, double r0,
 {
     double rise = y1 - y0, m0 = r0 * h, m1 = r1 * h;
     double up = rise > 0 ? 1.0 : -1.0;
-    if (up * m0 >= 0 && up * m1 >= 0 && fmax(fabs(m0), fabs(m1)) <= 3 * fabs(rise))
+    if (up * m0 >= 0 && up * m1 >= 0 && higher(fabs(m0), fabs(m1)) <= 3 * fabs(rise))
         return; /* surely monotone */
     double c2 = 3 * rise - 2 * m0 - m1, c3 = m0 + m1 - 2 * rise, square = c2 * c2 - 3 * c3 * m0;
     if (!(square > 0))
@@ -245,7 +245,7 @@ static double doubt(const struct curve *c, long k)
     if (h_left > 0)
         fourth = fabs(here - left) * 2 / (h + h_left);
     if (h_right > 0)
-        fourth = fmax(fourth, fabs(right - here) * 2 / (h + h_right));
+        fourth = higher(fourth, fabs(right - here) * 2 / (h + h_right));
     if (!(h_left > 0 || h_right > 0))
         fourth = h > 0 ? fabs(here) / h : 0.0;
     return fourth * h * h * h * h / 384;

@@ -91,7 +91,7 @@ static real method_step(struct fleet *f)
 /* Rate at the begin of a step after a jump, given as flat vector. */
 static void method_restart(struct fleet *f, int lane, const double *rate)
 {
-    to_lane(rate, NX, f->method->k[0], f->method->ks[0], lane);
+    to_lane(rate, NX, NW, f->method->k[0], f->method->ks[0], lane);
 }
 
 /* The lanes that are `taken` go on from the end of the step. */

@@ -21,6 +21,10 @@ static void at_knot(struct curve *c, long i, struct outcome *out)
     sharpen(c, i);
     out->time = c->t[i];
     out->place = c->between[i] ? PLACE_INSIDE : track->kind[k];
+    if (!c->between[i] && !track->nw) {
+        out->value = c->y[i]; /* values at nodes are exact as they are */
+        return;
+    }
     exactly(c, k, out->time, &out->value, &rate, out->gradient, 0);
     for (int w = 0; !c->between[i] && w < track->nw; w++)
         out->gradient[w] += rate * node_slope(track, k, w);
@@ -61,7 +65,7 @@ static void plain_minimum(struct curve *c, struct outcome *out)
             seen = 1;
             highest = level;
         }
-        highest = fmax(highest, c->y[i]);
+        highest = higher(highest, c->y[i]);
     }
     at_knot(c, low, out);
 }
@@ -96,7 +100,7 @@ static int holds(const struct curve *c, long i)
 
 static double within(double t, const double *node_t)
 {
-    return fmin(fmax(t, node_t[0]), node_t[1]);
+    return lower(higher(t, node_t[0]), node_t[1]);
 }
 
 /* Value and derivative of the level whose stretch lasts exactly the window. */
@@ -128,7 +132,7 @@ static void at_window(struct curve *c, const struct window *best, double length,
     a = out->time = polish_window(c, best, length);
     exactly(c, at_begin, within(a, track->t + at_begin), &y_a, &rate_a, s->a, 0);
     exactly(c, at_end, within(a + length, track->t + at_end), &y_b, &rate_b, s->b, 0);
-    out->value = fmax(y_a, y_b); /* the same, unless the polish met the end of an interval */
+    out->value = higher(y_a, y_b); /* the same, unless the polish met the end of an interval */
     for (int w = 0; w < nw; w++) /* flat at both ends: the level is that of the plateau */
         out->gradient[w] = rate_a != rate_b ? (rate_a * s->b[w] - rate_b * s->a[w]) / (rate_a - rate_b)
                                             : 0.5 * (s->a[w] + s->b[w]);
@@ -141,7 +145,7 @@ static void sustained(struct curve *c, double length, struct scratch *s, struct 
     struct window best = sustained_minimum(c, length);
     double off = doubt(c, c->node[best.how == AT_KNOT ? best.knot : best.begins]);
     if (best.how != AT_KNOT)
-        off = fmax(off, doubt(c, c->node[best.ends]));
+        off = higher(off, doubt(c, c->node[best.ends]));
     out->tie = several_stretches(c, best.level, TIE + 2 * off, length);
     if (best.how == AT_KNOT)
         at_knot(c, best.knot, out);

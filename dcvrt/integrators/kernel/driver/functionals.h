@@ -7,6 +7,11 @@
 #ifndef DCVRT_FUNCTIONALS_H
 #define DCVRT_FUNCTIONALS_H
 
+/* The larger and the smaller of two numbers in one instruction each, which fmax and fmin with their rule for NaN
+ * are not; with a NaN it is the second. */
+static inline double higher(double a, double b) { return a > b ? a : b; }
+static inline double lower(double a, double b) { return a < b ? a : b; }
+
 /* What stands at a node of a track, and what makes a result active. */
 enum place {
     PLACE_INSIDE = 0, /* node: nothing special; result: an extremum of the solution */

@@ -62,7 +62,9 @@ static void add_finely(struct curve *c, long k, double low, double high, struct 
 }
 
 /* Add the integral over the interval between the rows, with the fourth derivative that the change of the
- * third one tells (0 without an interval before). Returns 0, with nothing added, where that is too large. */
+ * third one tells (0 without an interval before). Where that is too large it tells nothing: a value alone is then
+ * that of the cubics, which were seen to meet the solution in the middle; with a gradient 0 is returned, and
+ * nothing added. */
 static int add_interval(double h, double h_before, int m, struct scratch *s, double *total)
 {
     int small = 1;
@@ -75,8 +77,10 @@ static int add_interval(double h, double h_before, int m, struct scratch *s, dou
         s->third[w] = third;
         s->sum[w] = h_before > 0 ? error * h : 0.0;
     }
-    if (!small)
+    if (!small && m > 1)
         return 0;
+    if (!small)
+        s->sum[0] = 0;
     add_cubics(h, m, s->left, s->left_rate, s->right, s->right_rate, s->sum);
     for (int w = 0; w < m; w++)
         total[w] += s->sum[w];
@@ -122,18 +126,18 @@ static void integral(struct curve *c, int positive, struct scratch *s, struct ou
     for (int w = 0; w < m; w++)
         total[w] = s->size[w] = 0;
     for (long i = 0; i < c->n; i++)
-        noise = fmax(noise, NOISE * fabs(c->y[i]));
+        noise = higher(noise, NOISE * fabs(c->y[i]));
     for (long k = 0, i = 0, next; k < track->n - 1; k++, i = next) {
         double low = c->y[i], high = c->y[i];
         next = i;
         do {
             next++;
-            low = fmin(low, c->y[next]);
-            high = fmax(high, c->y[next]);
+            low = lower(low, c->y[next]);
+            high = higher(high, c->y[next]);
         } while (c->between[next]);
         double h = track->t[k + 1] - track->t[k];
         if (!(h > 0)) { /* where the signal jumps, the integral moves with the time of the jump */
-            double jump = positive ? fmax(c->y[i], 0) - fmax(c->y[next], 0) : c->y[i] - c->y[next];
+            double jump = positive ? higher(c->y[i], 0) - higher(c->y[next], 0) : c->y[i] - c->y[next];
             for (int w = 0; w < track->nw; w++)
                 total[1 + w] += jump * node_slope(track, k, w);
             h_before = 0;
@@ -153,8 +157,8 @@ static void integral(struct curve *c, int positive, struct scratch *s, struct ou
         }
         row_at_node(c, k + 1, s->right, s->right_rate);
         for (int w = 0; w < m; w++) /* what is small beside the signal itself need not be small in itself */
-            s->size[w] = fmax(fmax(s->size[w], fabs(s->right[w])), 1e-4 * s->size[0]);
-        if (!add_interval(h, h_before, m, s, total))
+            s->size[w] = higher(higher(s->size[w], fabs(s->right[w])), 1e-4 * s->size[0]);
+        if (!add_interval(h, h_before, m, s, total) && m > 1)
             add_finely(c, k, track->t[k], track->t[k + 1], s, total);
         h_before = h;
         loaded = k + 1;

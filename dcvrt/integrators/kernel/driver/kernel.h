@@ -30,6 +30,7 @@ enum {
 #define SAME_INSTANT 1e-9
 #define LOCATED 1e-12
 #define WATCH_FLOOR 100.0 /* cubics may miss a watched output by so many absolute tolerances of the states */
+#define ONE_CUBIC 0.1 /* inputs are one cubic if they are off it by so much of what cubics may miss of an output */
 enum { MAX_JUMPS_AT_ONCE = 50, MAX_EVENTS = 10000 };
 
 /* How a course ended; the sentence is made of these in Python. */
@@ -46,6 +47,9 @@ enum status {
     NO_EQUILIBRIUM = 9,
     UNDER_WAY = -1
 };
+
+/* What a step saw of the inputs: it may have missed a pulse; it has not; they are one cubic on it. */
+enum seen { INPUTS_UNSEEN, INPUTS_SEEN, INPUTS_ONE_CUBIC };
 
 /* The inputs of a case: pieces on which each is a cubic. A row holds start, 1/length, then for each power of
  * (t - start)/length the inputs, then likewise the tangents of the phasor: real parts of all thetas,
@@ -87,8 +91,8 @@ struct phase {
 /* What a course leaves. Arrays grow; those of one record have the same length. */
 struct record {
     long samples, steps, nodes, events, phases, breaks;
-    long sample_room, step_room, node_room, event_room, phase_room, break_room;
-    double *sample_t, *sample_x, *sample_z;
+    long sample_room, output_room, step_room, node_room, event_room, phase_room, break_room;
+    double *sample_t, *sample_x, *sample_z, *sample_y, *sample_rate; /* the last two by keep_samples */
     long *sample_piece, *sample_phase, *sample_step;
     double *step_t, *step_h, *step_x;
     long *step_piece, *step_phase;
@@ -153,12 +157,18 @@ struct result {
     double *event;
 };
 
+/* What is a corner, and how it is resolved: the constants of corners.py. */
+struct corners {
+    double missed, sharper;
+    int parts, levels;
+};
+
 /* course.c */
 int course_begin(struct course *c, const struct task *task, const struct options *options);
 int course_move(struct course *c, double t, const double *x, const double *z);
 int course_cross(struct course *c, const double *h0, const double *r0, double t1, const double *h1,
                  const double *r1);
-int course_inputs_seen(struct course *c, double t1);
+enum seen course_inputs(struct course *c, double t1);
 int course_record(struct course *c, double t1, const double *x1, const double *z1);
 void course_fail(struct course *c, enum status status, double from, double to);
 void course_guards(struct course *c, double t, const double *x, const double *z, double *h, double *rate);
@@ -179,6 +189,11 @@ void nodes_at(struct course *c, double t, const double *x, const double *z, doub
 struct again *again_new(const struct options *options);
 void again_free(struct again *a);
 void step_again(struct course *c, double h);
+
+/* outputs.c */
+int outputs_on(const struct task *task, const struct phase *phases, long n, const double *t, const double *x,
+               const double *z, const long *piece, const long *phase, double *y, double *rate, double *y_theta,
+               double *rate_theta);
 
 /* single.c */
 void work_done(struct work *w, long number, struct course *c);

@@ -34,11 +34,11 @@ static inline double *theta_at(column *columns, int rows, int j, int i, int lane
 #endif
 }
 
-/* Values, then their derivatives theta after theta, to a lane and back. */
-static void to_lane(const double *flat, int rows, real *x, column *xs, int lane)
+/* Values, then their derivatives by so many thetas, one theta after the other, to a lane; and back, by all. */
+static void to_lane(const double *flat, int rows, int thetas, real *x, column *xs, int lane)
 {
     for (int i = 0; i < rows; i++) AT(x[i], lane) = flat[i];
-    for (int j = 0; j < NW; j++)
+    for (int j = 0; j < thetas; j++)
         for (int i = 0; i < rows; i++) *theta_at(xs, rows, j, i, lane) = flat[rows + j * rows + i];
 }
 
@@ -88,6 +88,7 @@ struct fleet {
     struct course *course[LANES];
     long loaded[LANES], first_piece[LANES], last_piece[LANES], number[LANES];
     int spans[LANES], last[LANES], live[LANES];
+    enum seen seen[LANES]; /* on the last step */
     double wanted[LANES], step[LANES], trend[LANES];
 };
 
@@ -299,8 +300,8 @@ static void lay_state(struct fleet *f, int lane, double *rate)
     struct course *c = f->course[lane];
     const struct inputs *in = c->task->inputs;
     AT(f->t, lane) = c->t;
-    to_lane(c->x, NX, f->x, f->xs, lane);
-    to_lane(c->z, NZ, f->z, f->zs, lane);
+    to_lane(c->x, NX, NW, f->x, f->xs, lane);
+    to_lane(c->z, NZ, NW, f->z, f->zs, lane);
     lay_fixed(f, lane, c->m, c->mc, c->entry);
     f->first_piece[lane] = in->section[c->section];
     f->last_piece[lane] = in->section[c->section + 1] - 1;
@@ -360,7 +361,8 @@ static int judge_step(struct fleet *f, int lane, double error)
     struct course *c = f->course[lane];
     const struct options *o = c->options;
     double h = f->step[lane], t1 = f->last[lane] ? c->limit : c->t + h;
-    if (error <= 1.0 && f->spans[lane] && !course_inputs_seen(c, t1)) error = 16.0;
+    f->seen[lane] = error <= 1.0 && f->spans[lane] ? course_inputs(c, t1) : INPUTS_ONE_CUBIC;
+    if (f->seen[lane] == INPUTS_UNSEEN) error = 16.0;
     if (error <= 1.0) {
         double now = rough_log2(fmax(error, 1e-10)), factor;
         factor = 0.9 * rough_exp2(CONTROL_BEFORE * f->trend[lane] - CONTROL_NOW * now);
@@ -409,14 +411,16 @@ static int after_step(struct fleet *f, int lane, int crossing, int missed)
     struct course *c = f->course[lane];
     const struct options *o = c->options;
     double t1 = f->last[lane] ? c->limit : c->t + f->step[lane], x1[N], z1[AT_LEAST_ONE(NZN)];
-    int look_closer = crossing || (c->watches_input && f->spans[lane]);
-    int refine = missed || (WATCH_READS_INPUT && f->spans[lane]);
+    int varied = f->seen[lane] != INPUTS_ONE_CUBIC;
+    int look_closer = crossing || (c->watches_input && varied);
+    int refine = missed || (WATCH_READS_INPUT && varied);
     if (o->steps) {
         from_lane(x1, NX, f->x, f->xs, lane);
         from_lane(z1, NZ, f->z, f->zs, lane);
         if (!record_step(c, c->t, f->step[lane], x1, z1)) return 0;
     }
-    if (look_closer || refine || o->samples) method_dense(f, lane, &c->dense);
+    int samples_inside = o->samples && f->step[lane] > o->save_at;
+    if (look_closer || refine || samples_inside) method_dense(f, lane, &c->dense);
     if (look_closer) {
         double h0[AT_LEAST_ONE(GUARDS)], r0[AT_LEAST_ONE(GUARDS)], h1[AT_LEAST_ONE(GUARDS)], r1[AT_LEAST_ONE(GUARDS)];
         for (int k = 0; k < GUARDS; k++) {

@@ -32,7 +32,7 @@ static int halve(struct course *c, double ta, const double *ya, const double *ra
     nodes_on_step(c, t, y, rate);
     for (int j = 0; j < WATCHED; j++) {
         double cubic = 0.5 * (ya[j] + yb[j]) + 0.125 * (tb - ta) * (ra[j] - rb[j]);
-        double size = fmax(c->largest[j], fabs(y[j]));
+        double size = higher(c->largest[j], fabs(y[j]));
         missed |= !(fabs(y[j] - cubic) <= c->options->watch_tolerance * size + WATCH_FLOOR * c->options->atol);
     }
     if (!missed) return 1;

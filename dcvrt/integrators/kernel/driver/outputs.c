@@ -1,38 +1,7 @@
 /* Outputs, their rates and sensitivities on the samples of a course, LANES samples at once. */
 
-/* Intervals between samples in which an output turns a corner that its cubic misses, as corners.py finds them:
- * the slope changes by so much that the cubic may be off by `missed` of the output's size, and the curvature is
- * `sharper` times that of both neighbours in the phase. Returns how many. */
-long corners_at(long n, const double *t, const double *y, const double *rate, const long *phase, double missed,
-                double sharper, long *found)
-{
-    long count = 0;
-    for (long begin = 0, end; begin < n; begin = end) {
-        double size[AT_LEAST_ONE(NY)];
-        for (int j = 0; j < NY; j++) size[j] = 1e-3;
-        for (end = begin; end < n && phase[end] == phase[begin]; end++)
-            for (int j = 0; j < NY; j++) size[j] = fmax(size[j], fabs(y[end * NY + j]));
-        if (end - begin < 3) continue;
-        for (long i = begin; i + 1 < end; i++) {
-            double h = t[i + 1] - t[i];
-            for (int j = 0; j < NY; j++) {
-                const double *r = rate + i * NY + j;
-                double turn = fabs(r[NY] - r[0]);
-                if (!(turn * h > 8 * missed * size[j])) continue;
-                double before = i > begin ? fabs(r[0] - r[-NY]) / (t[i] - t[i - 1]) : 0;
-                double after = i + 2 < end ? fabs(r[2 * NY] - r[NY]) / (t[i + 2] - t[i + 1]) : 0;
-                if (turn / h > sharper * fmax(before, after)) {
-                    found[count++] = i;
-                    break;
-                }
-            }
-        }
-    }
-    return count;
-}
-
-/* Arrays are sample-major; derivatives by theta are [sample][output][theta], times the scale of theta, and are
- * left out when `y_theta` is null. */
+/* Arrays are sample-major; derivatives by the thetas themselves are [sample][output][theta], and are left out when
+ * `y_theta` is null. */
 int outputs_on(const struct task *task, const struct phase *phases, long n, const double *t, const double *x,
                const double *z, const long *piece, const long *phase, double *y, double *rate,
                double *y_theta, double *rate_theta)
@@ -44,6 +13,9 @@ int outputs_on(const struct task *task, const struct phase *phases, long n, cons
     real d[NX], lane_y[AT_LEAST_ONE(NY)], lane_rate[AT_LEAST_ONE(NY)];
     column ds[AT_LEAST_ONE(GROUPS * NX)];
     column ys[AT_LEAST_ONE(GROUPS * NY)], yrs[AT_LEAST_ONE(GROUPS * NY)];
+    double inverse[AT_LEAST_ONE(NW)];
+    for (int j = 0; j < NW; j++) inverse[j] = 1.0 / theta_scale[j];
+    int thetas = y_theta ? NW : 0;
     long laid[LANES];
     for (int l = 0; l < LANES; l++) courses[l].task = task, laid[l] = -1, f->loaded[l] = -1;
     f->at.z = f->z1, f->at.zs = f->zs1, f->at.d = d, f->at.ds = ds;
@@ -59,8 +31,8 @@ int outputs_on(const struct task *task, const struct phase *phases, long n, cons
             }
             if (f->loaded[l] != piece[k]) load_piece(f, l, piece[k]);
             AT(f->t, l) = t[k];
-            to_lane(x + k * N, NX, f->x1, f->xs1, l);
-            to_lane(z + k * NZN, NZ, f->z1, f->zs1, l);
+            to_lane(x + k * N, NX, thetas, f->x1, f->xs1, l);
+            to_lane(z + k * NZN, NZ, thetas, f->z1, f->zs1, l);
         }
         fleet_inputs(f, 0.0, 1);
         f->at.x = f->x1;
@@ -81,8 +53,8 @@ int outputs_on(const struct task *task, const struct phase *phases, long n, cons
                 y[k * NY + i] = AT(lane_y[i], l);
                 rate[k * NY + i] = AT(lane_rate[i], l);
                 for (int j = 0; j < NW && y_theta; j++) {
-                    y_theta[(k * NY + i) * NW + j] = *theta_at(ys, NY, j, i, l);
-                    rate_theta[(k * NY + i) * NW + j] = *theta_at(yrs, NY, j, i, l);
+                    y_theta[(k * NY + i) * NW + j] = *theta_at(ys, NY, j, i, l) * inverse[j];
+                    rate_theta[(k * NY + i) * NW + j] = *theta_at(yrs, NY, j, i, l) * inverse[j];
                 }
             }
         }

@@ -23,10 +23,12 @@ static int grow_bytes(unsigned char **array, long room)
     return larger != 0;
 }
 
-static int grow_samples(struct record *r)
+/* Room for so many samples. */
+static int room_for_samples(struct record *r, long n)
 {
-    if (r->samples < r->sample_room) return 1;
-    long room = r->sample_room ? 2 * r->sample_room : 4096;
+    if (n <= r->sample_room) return 1;
+    long room = 2 * r->sample_room > n ? 2 * r->sample_room : n;
+    if (room < 4096) room = 4096;
     if (!grow(&r->sample_t, 1, room) || !grow(&r->sample_x, N, room) || !grow(&r->sample_z, NZN, room) ||
         !grow_longs(&r->sample_piece, room) || !grow_longs(&r->sample_phase, room) ||
         !grow_longs(&r->sample_step, room))
@@ -86,7 +88,7 @@ static void record_clear(struct record *r)
 
 void record_free(struct record *r)
 {
-    free(r->sample_t), free(r->sample_x), free(r->sample_z);
+    free(r->sample_t), free(r->sample_x), free(r->sample_z), free(r->sample_y), free(r->sample_rate);
     free(r->sample_piece), free(r->sample_phase), free(r->sample_step);
     free(r->step_t), free(r->step_h), free(r->step_x), free(r->step_piece), free(r->step_phase);
     free(r->node_t), free(r->node_y), free(r->node_rate), free(r->node_step), free(r->node_break);
@@ -105,7 +107,7 @@ static int out_of_memory(struct course *c)
 static int add_sample(struct course *c, double t, const double *x, const double *z, long piece)
 {
     struct record *r = &c->record;
-    if (!grow_samples(r)) return out_of_memory(c);
+    if (!room_for_samples(r, r->samples + 1)) return out_of_memory(c);
     long k = r->samples++;
     r->sample_t[k] = t;
     memcpy(r->sample_x + k * N, x, N * sizeof(double));
@@ -125,7 +127,7 @@ static int add_node(struct course *c, double t, const double *y, const double *r
     for (int j = 0; j < WATCHED; j++) {
         r->node_y[k * WATCHED + j] = y[j];
         r->node_rate[k * WATCHED + j] = rate[j];
-        c->largest[j] = fmax(c->largest[j], fabs(y[j]));
+        c->largest[j] = higher(fabs(y[j]), c->largest[j]);
     }
     r->node_step[k] = step;
     r->node_break[k] = -1;

@@ -49,7 +49,7 @@ static void look(const struct curve *c, long i, long j, double from, double to, 
     if (i == j && falling)
         rising = 0;
     double highest = top >= 0 ? c->y[top] : -INFINITY;
-    double bound = fmax(highest, fmax(falling ? e1 : -INFINITY, rising ? f0 : -INFINITY));
+    double bound = higher(highest, higher(falling ? e1 : -INFINITY, rising ? f0 : -INFINITY));
     if (!(bound < best->level))
         return;
     struct window found = {bound, from, AT_KNOT, top, i, j};

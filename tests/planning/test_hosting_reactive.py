@@ -1,0 +1,92 @@
+"""Plans with units within their reactive limits, and voltages of all hours told from few."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dcvrt.grid import powerflow
+from dcvrt.grid.network import Network
+from dcvrt.grid.powerflow import PowerFlow
+from dcvrt.planning import HostingProblem, profiles
+from dcvrt.planning.agreement import GUARD
+from dcvrt.planning.interpolation import VoltageDrop
+from dcvrt.planning.voltage_screen import HostedFlow
+
+SITES = (21, 75, 106, 108)
+NETWORK = Network.ieee118()
+YEAR = profiles.ieee118()
+WEEK = YEAR.window(range(8400, 8568))
+
+
+def largest_alone(site: int, hour: int, limited: bool) -> float:
+    """Bisection on single power flows: the largest load at a site with every voltage in 0.94-1.06."""
+    year = YEAR.window([hour])
+    flow = PowerFlow(NETWORK, limited)
+    base = powerflow.injections(NETWORK, year.load, year.wind)[:, 0]
+    change = powerflow.hosting_directions(NETWORK, [site], 0.98)[0] * year.dc[0]
+
+    def good(mw: float) -> bool:
+        size = abs(flow.solve(base + mw * change).v[flow.moving])
+        return bool(size.min() >= 0.94 and size.max() <= 1.06)
+
+    low, high = 0.0, 200.0
+    assert good(low)
+    assert not good(high)
+    while high - low > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("limited", [True, False])
+@pytest.mark.parametrize("site", [75, 106, 108])
+def test_one_site_hosts_what_a_bisection_on_power_flows_finds(site: int, limited: bool) -> None:
+    problem = HostingProblem(NETWORK, (site,), YEAR.window([8441]), 1.0, reactive_limits=limited)
+    expected = largest_alone(site, 8441, limited)
+    assert problem.solve().total_mw == pytest.approx(expected, abs=2e-3)
+
+
+def test_plan_within_reactive_limits_hosts_less_and_passes_in_every_hour() -> None:
+    plans = {}
+    for limited in (True, False):
+        problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6, reactive_limits=limited)
+        plan = problem.solve()
+        plans[limited] = plan, problem.check_ac(plan)
+    (kept, kept_ac), (loose, loose_ac) = plans[True], plans[False]
+    assert kept.total_mw < 0.8 * loose.total_mw
+    assert kept_ac.passed
+    assert loose_ac.passed  # with the voltages of units held whatever that takes
+    assert kept_ac.reactive is not None
+    assert loose_ac.reactive is not None
+    assert not kept_ac.reactive
+    assert loose_ac.reactive.above.excess_mvar > 10
+    strict = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    assert not strict.check_ac(loose).passed
+
+
+def test_a_little_more_breaks_a_voltage_limit_in_some_hour() -> None:
+    problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    plan = problem.solve()
+    H = np.array(list(plan.by_site.values()))
+    moving = problem.ac.flow.moving
+    for i in range(len(SITES)):
+        more = H + 0.05 * np.eye(len(SITES))[i]
+        assert abs(problem.ac.solve(more).require().v[moving]).min() < 0.94
+
+
+def test_few_hours_tell_the_voltages_of_all_without_switching() -> None:
+    year = YEAR.window(range(6000, 8760))
+    ac = HostedFlow(NETWORK, SITES, year, 0.98, reactive_limits=False)
+    H = np.array([30.0, 145.0, 90.0, 95.0])
+    exact = abs(ac.base) - abs(ac.solve(H).require().v)
+    drop = VoltageDrop(year)
+    assert len(drop.sample) < 0.03 * len(year)
+    found = drop.expect(exact[:, drop.sample], drop.sample)
+    assert found == pytest.approx(exact, abs=GUARD)  # so the least guard band covers it
+    assert abs(exact).max() > 0.03
+
+
+def test_few_hours_are_all_solved() -> None:
+    year = YEAR.window(range(8424, 8448))
+    assert VoltageDrop(year).sample.tolist() == list(range(24))
