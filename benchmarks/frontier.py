@@ -150,8 +150,9 @@ def _data(spent: Counter, gradients: bool) -> tuple[MarginData, Any]:
         return np.array([row[name] for row in rows], dtype=kind)
 
     data = MarginData(
-        setting.sites, np.array(H), np.array([setting.d[row["period"]] for row in rows]), column("period", str),
-        column("fault", str), column("mode", str), column("site", np.int64), column("beta"),
+        setting.sites, np.array(H), np.array([setting.d[row["period"]] for row in rows]),
+        column("period", str), column("fault", str), column("mode", str), column("site", np.int64),
+        column("beta"),
         column("v_margin_pu"), column("loss_margin_share"), column("loss_margin_mw"), column("ok", bool),
         column("status", str), column("sequence", str), np.array(fit), np.array(names),
     )  # fmt: skip
