@@ -32,6 +32,8 @@ OUTPUTS = (
     "mode",
     "stored",
     "p_loss",
+    "i.re",
+    "i.im",
 )
 SYSTEMS = {name: System(facility.get(name).compile()) for name in VARIANTS}
 

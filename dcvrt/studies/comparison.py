@@ -16,8 +16,8 @@ def comparison(store: Store) -> dict[str, Any]:
     Returns
     -------
     dict
-        `rows`: mode, beta, and for each method total_mw, by_site, passed (the replay; None where nothing is
-        hosted), false_pass (it hosts something and failed) and closed; gain_mw: what the frontier hosts beyond
+        `rows`: mode, beta; for each method total_mw, by_site, passed (the replay; None where nothing is
+        hosted), false_pass (it hosts and failed) and closed; gain_mw: what the frontier hosts beyond
         the paper's method, None where the plan of either failed; of the frontier: margins (what binds),
         by_sequence, candidates, refused, gap, settled.
         `simulations`: by role of the hosting vector (`paper`: the samples of the fits; `frontier`: samples

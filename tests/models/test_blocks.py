@@ -101,7 +101,7 @@ FEEDTHROUGH = {
         "shortfall": {"ask", "v", "share", "w"},
     },
     CurrentLag: {"i": {"delta"}},
-    Poi: {"p": {"v", "i"}, "q": {"v", "i"}, "i_mag": {"i"}},
+    Poi: {"p": {"v", "i"}, "q": {"v", "i"}, "i_mag": {"i"}, "drawn": {"i"}},
     Cooling: {"p": set()},
     DcLink: {"drain": {"p_out"}, "energy": set(), "loss": {"p_out"}},
     DcEnergyLoop: {"p_c": {"w", "p_ref", "v", "share"}, "q_c": {"w", "p_ref", "v", "share"}},

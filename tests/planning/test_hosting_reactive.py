@@ -84,7 +84,7 @@ def test_few_hours_tell_the_voltages_of_all_without_switching() -> None:
     assert len(drop.sample) < 0.03 * len(year)
     found = drop.expect(exact[:, drop.sample], drop.sample)
     assert found == pytest.approx(exact, abs=GUARD)  # so the least guard band covers it
-    assert abs(exact).max() > 0.03
+    assert abs(exact).max() > 100 * GUARD  # or the comparison would say nothing
 
 
 def test_few_hours_are_all_solved() -> None:

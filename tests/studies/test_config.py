@@ -84,7 +84,7 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
         "my.toml: 7 problems\n"
         "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
         "sampling, surrogate, frontier, replay, run, "
-        "fault, period, what_if.\n"
+        "fault, period, ... (13 in all).\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
         "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "
         "step_s, redispatch.\n"

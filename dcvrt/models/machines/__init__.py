@@ -14,7 +14,7 @@ from dcvrt.models.machines.ieeet1 import Ieeet1
 from dcvrt.models.machines.parts import UNLIMITED, UnitBlock, quadratic
 from dcvrt.models.machines.sexs import Sexs
 from dcvrt.models.machines.st2cut import St2Cut
-from dcvrt.models.machines.static_load import ExponentialLoad, ZipLoad
+from dcvrt.models.machines.static_load import ExponentialLoad, StaticLoad, ZipLoad
 from dcvrt.models.machines.tgov1 import Tgov1, Tgov1N
 from dcvrt.models.machines.unit import alone, setpoints, structure, unit
 
@@ -40,6 +40,7 @@ __all__ = [
     "Ieeex1BusFed",
     "NoStabiliser",
     "Sexs",
+    "StaticLoad",
     "St2Cut",
     "Tgov1",
     "Tgov1N",

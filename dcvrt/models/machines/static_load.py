@@ -14,7 +14,10 @@ OWN = "own choice"
 
 
 class StaticLoad(UnitBlock):
-    """What loads without memory have: power at 1 pu, and a voltage below which they are impedances."""
+    """Load without memory: an impedance here, other dependences on the voltage in what derives from it.
+
+    Equilibrium: none of its own, it has no state.
+    """
 
     p_0 = Parameter(0.0, "pu(S)", (-1e4, 1e4), "active power at 1 pu", "found by the initialisation")
     q_0 = Parameter(0.0, "pu(S)", (-1e4, 1e4), "reactive power at 1 pu", "found by the initialisation")

@@ -34,9 +34,9 @@ def frontier(findings: Findings) -> Safe:
         "Paper's method and frontier",
         paragraph(
             "The paper's method fits affine margins to samples, lowers them by their largest error and keeps "
-            "plans to the sampled box. The frontier simulates its own candidates, with the derivative of every "
-            "margin by every site's capacity, cuts off what fails, and ends when nothing is left to gain. Both "
-            "are replayed in the same way."
+            "plans to the sampled box. The frontier simulates its own candidates, with the derivative of "
+            "every margin by every site's capacity, cuts off what fails, and ends when nothing is left to "
+            "gain. Both are replayed in the same way."
         ),
         table(
             "Both methods at every mode and rating",

@@ -32,6 +32,7 @@ from dcvrt.models.machines import (
     NoStabiliser,
     Sexs,
     St2Cut,
+    StaticLoad,
     Tgov1,
     Tgov1N,
     ZipLoad,
@@ -72,6 +73,7 @@ def test_every_symbol_is_documented(kind):
 FEEDTHROUGH = {
     GenRou: {"i": {"v"}, "t_e": {"v"}, "i_f": {"v"}},
     GenCls: {"i": {"v", "v_f"}, "t_e": {"v", "v_f"}, "i_f": {"v_f"}},
+    StaticLoad: {"i": {"v"}},
     ExponentialLoad: {"i": {"v"}},
     ZipLoad: {"i": {"v"}},
     CurrentConverter: {"i": set()},
@@ -185,6 +187,7 @@ RESTS = [
     ),
     (
         St2Cut,
+    StaticLoad,
         dict(signal_2=5.0, K_2=2.0),
         dict(
             omega=1.0, f=1.0, t_e=0.8, t_m=0.8, p_set=0.8, v=V,
