@@ -187,7 +187,6 @@ RESTS = [
     ),
     (
         St2Cut,
-    StaticLoad,
         dict(signal_2=5.0, K_2=2.0),
         dict(
             omega=1.0, f=1.0, t_e=0.8, t_m=0.8, p_set=0.8, v=V,
