@@ -213,7 +213,13 @@ class Engine:
             facility = facilities[buses[0]]
             structure = self._structure_of(facility)
             known = {path: value for path, value in given.items() if path in structure.dae.p_names}
-            structure.dae.parameter_values(**known)
+            try:
+                structure.dae.parameter_values(**known)
+            except InputError as error:
+                raise InputError(
+                    f"{self.network.name}, {period.name}: facility {facility.name} at bus {buses[0]} "
+                    f"cannot run there: {error} Way out: another dc_factor or pf, or no facility at this bus."
+                ) from None
             units = [
                 Unit(f"facility {facility.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
                 for bus in buses

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dcvrt import facility
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import BusFault, FaultSequence, Grid, LineTrip, Period, andes
 from dcvrt.grid.native import build
@@ -208,3 +209,18 @@ def test_a_unit_that_starts_outside_a_limit_is_named(tmp_path: Path) -> None:
     text = str(failure.value)
     assert text.startswith("small, base: 1 limit(s) are exceeded before the fault: ")
     assert "at bus 1: governor" in text
+
+
+def test_a_facility_that_cannot_run_in_the_period_is_named() -> None:
+    grid = Grid.from_case("ieee118", sites=(21, 75))
+    with pytest.raises(InputError) as failure:
+        grid.waveforms(
+            {75: 10.0},
+            BusFault(23),
+            period=Period("empty", dc_factor=0.0),
+            facilities={75: facility.gfl()},
+        )
+    assert str(failure.value) == (
+        "ieee118, empty: facility gfl at bus 75 cannot run there: d = 0 is outside [0.1, 1.2]. "
+        "Way out: another dc_factor or pf, or no facility at this bus."
+    )
