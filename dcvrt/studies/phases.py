@@ -15,6 +15,7 @@ import numpy as np
 from dcvrt.errors import DcvrtError, InputError
 from dcvrt.planning import replay
 from dcvrt.planning.hosting import HostingProblem
+from dcvrt.planning.kept import one_sided
 from dcvrt.planning.plan import Plan
 from dcvrt.planning.sampling import Samples, sample_hosting
 from dcvrt.planning.surrogate import MarginData, Surrogate, fit_surrogates
@@ -279,6 +280,7 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
     fits = [fit for method in setting.file.surrogate.methods for fit in fit_surrogates(data, method)]
     with store.transaction():
         store.clear("surrogates", "predictions")
+        store.note(one_sided=one_sided(data))
         for fit in fits:
             key = {
                 name: getattr(fit, name)

@@ -54,8 +54,19 @@ def validation(findings: Findings) -> Safe:
         "failed runs left out of the fit",
         "fits of mixed sequences",
     ]
+    one_sided = findings.provenance.get("one_sided", [])
     return section(
         "How good the fitted margins are",
+        *(
+            [
+                paragraph(
+                    f"Of {len(one_sided)} margins the fitting set has seen one side only, met or missed, or "
+                    "no result at all; a fit that says the other side extrapolates."
+                )
+            ]
+            if one_sided
+            else []
+        ),
         paragraph(
             "Each margin is fitted on some of the samples, lowered by its largest overprediction there, "
             "and judged on samples that the fit has not seen. A false pass is a point that the fit passes "
