@@ -411,7 +411,7 @@ class Grid:
             f"facilities: {type(diagram).__name__} at bus {bus} is no diagram. Way out: facility.gfl() and "
             "its like."
             for bus, diagram in (facilities or {}).items()
-            if engine == "native" and not isinstance(diagram, Diagram)
+            if engine == "native" and not isinstance(diagram, Diagram | Dae)
         ]
         for bus, mw in hosting.items():
             if bus not in self.sites:
