@@ -35,7 +35,7 @@ def check(rows: list[Result], tmp_path: Path) -> None:
 
 
 def test_what_is_a_benchmark() -> None:
-    assert names() == ["ensemble", "grid", "hosting", "integrators", "sensitivities"]
+    assert names() == ["ensemble", "frontier", "grid", "hosting", "integrators", "sensitivities"]
 
 
 @needs_compiler

@@ -40,9 +40,9 @@ class Programme:
             float(found.H.sum()),
             dict(zip(self.sites, found.H.tolist(), strict=True)),
             tuple(
-                Binding("row", row.label, float(price), "MW", row.lower, bus=row.site)
-                for row, price in zip(master.rows, found.row_price, strict=True)
-                if price > 1e-7
+                Binding("row", row.label, float(-dual), "MW", row.lower, bus=row.site)
+                for row, dual in zip(master.rows, found.row_dual, strict=True)
+                if dual < -1e-7  # the lower limit binds
             ),
             {
                 bus: row.label
