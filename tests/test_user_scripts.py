@@ -62,18 +62,19 @@ def test_run_it_with_sensitivities(tmp_path: Path) -> None:
     assert table["loss"].is_monotonic_increasing
 
 
-@pytest.mark.slow
 def test_waveforms_from_the_grid() -> None:
-    from dcvrt.errors import InputError
+    from dcvrt import facility
     from dcvrt.grid import BusFault, Grid
 
     grid = Grid.from_case("ieee118", sites=(21, 75, 106, 108))
     hosting = {21: 31.4, 75: 153.9, 106: 102.4, 108: 104.1}
-    w = grid.waveforms(hosting, BusFault(23, start=1.0, clear=0.1), until=2.0)
+    fault = BusFault(23, start=1.0, clear=0.1)
+    w = grid.waveforms(hosting, fault, until=6.0, engine="native", wrt=("H",))
     assert abs(w[75].at(1.05)) < abs(w[75].at(0.5))
-    assert w[75].t.shape == w[75].v.shape
-    with pytest.raises(InputError, match="native"):
-        grid.waveforms(hosting, BusFault(23, start=1.0, clear=0.1), until=2.0, engine="native", wrt=("H",))
+    assert w[75].t.shape == w[75].v.shape == w[75].tangents["H_21"].shape
+    assert np.iscomplexobj(w[75].tangents["H_21"])
+    coupled = grid.waveforms(hosting, fault, facilities={75: facility.gfm()})
+    assert abs(coupled[75].at(1.05)) < abs(coupled[75].at(0.5))
 
 
 def test_hosting_capacity(tmp_path: Path) -> None:
