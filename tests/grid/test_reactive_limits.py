@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dcvrt.grid import powerflow
-from dcvrt.grid.andes import prepare
+from dcvrt.grid import andes, powerflow
 from dcvrt.grid.network import Branches, Generators, Network
 from dcvrt.grid.powerflow import PowerFlow
 from dcvrt.planning import profiles
@@ -203,16 +202,20 @@ def test_sparse_and_dense_matrices_give_the_same(network: Network, monkeypatch: 
 
 @pytest.mark.slow
 def test_switched_power_flow_equals_andes(network: Network) -> None:
-    import andes
+    import gc
 
-    system = andes.load(
-        andes.get_case("matpower/case118.m"),
-        no_output=True,
-        default_config=True,
-        config_option=["PV.pv2pq=1", "PFlow.tol=1e-11"],
-        pycode_path=str(prepare()),
-    )
-    assert system.PFlow.run()
+    from andes import load
+
+    with andes.quiet():
+        system = load(
+            str(andes.case118()),
+            no_output=True,
+            default_config=True,
+            config_option=["PV.pv2pq=1", "PFlow.tol=1e-11"],
+            pycode_path=str(andes.prepare()),
+        )
+        gc.collect()  # the pool of processes that it leaves open is told here, or in whatever test comes next
+        assert system.PFlow.run()
     injection = powerflow.injections(network, np.ones(1), {})[:, 0]
     demand = -injection.imag
     p = np.zeros(118)  # the schedule of the case itself
