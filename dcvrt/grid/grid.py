@@ -15,6 +15,7 @@ from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
 from dcvrt.grid.faults import BusFault, Fault, FaultSequence, LineTrip, branch
 from dcvrt.grid.native.engine import Engine, sample_times, thetas
+from dcvrt.grid.native.steady import Flow, loads
 from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
@@ -93,7 +94,7 @@ class Grid:
         Who supplies a change of load. `proportional`: all scheduled units in proportion to their schedule, up
         to their limits, losses included; `slack`: the unit at the slack bus.
     reactive_limits : bool
-        Whether the native engine's power flow keeps units within their reactive limits; ANDES's does not.
+        Whether the power flow keeps units within their reactive limits; the slack bus has none.
     load_model, wind_model : block of `dcvrt.models.machines`, optional
         What network loads and wind are in a fault, for the native engine: `ExponentialLoad`, `ZipLoad`,
         `CurrentConverter`. Impedances when not given.
@@ -137,7 +138,7 @@ class Grid:
         redispatch : str
             `proportional` or `slack`.
         reactive_limits : bool
-            Whether the native engine's power flow keeps units within their reactive limits.
+            Whether the power flow keeps units within their reactive limits; the slack bus has none.
         load_model, wind_model : block of `dcvrt.models.machines`, optional
             What network loads and wind are in a fault, for the native engine; impedances when not given.
 
@@ -170,7 +171,9 @@ class Grid:
         return Network.ieee118() if self.rule else andes.read_network(self.path, self.dynamics, self.name)
 
     def __getstate__(self) -> dict[str, object]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("network", "native")}
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("network", "native", "flow")
+        }
 
     # -- what is asked for ---------------------------------------------------------------------------------
 
@@ -322,6 +325,17 @@ class Grid:
             self.wind_model,
         )
 
+    @cached_property
+    def flow(self) -> Flow:
+        """Power flow of single operating points.
+
+        Raises
+        ------
+        InputError
+            When a bus has several units.
+        """
+        return Flow(self.network)
+
     @property
     def machines(self) -> Sequence[dynamics118.Machine]:
         """Machines that the rule table adds to the case file."""
@@ -337,6 +351,7 @@ class Grid:
             andes.add_machines(system, self.machines)
         q_per_p = float(np.tan(np.arccos(self.pf)))
         hosted = {bus: period.dc_factor * hosting.get(bus, 0.0) * (1 + 1j * q_per_p) for bus in self.sites}
+        where = f"{self.name}, {period.name}"
         return OperatingPoint(
             system,
             hosted,
@@ -344,8 +359,18 @@ class Grid:
             period.load_scale,
             faults,
             self.redispatch,
-            f"{self.name}, {period.name}",
+            where,
+            self._set_points(hosted, period, where) if self.reactive_limits else {},
         )
+
+    def _set_points(self, hosted: Mapping[int, complex], period: Period, where: str) -> dict[int, float]:
+        """Voltages at which the units that cannot hold theirs give their reactive limit, pu.
+
+        ANDES holds what it is given: it converts a unit beyond its limit, but never back.
+        """
+        load = loads(self.network, hosted, period.wind, period.load_scale)
+        found = self.flow.solve(load, self.redispatch, True, where)
+        return {bus: float(abs(found.v[self.network.index(bus)])) for bus in found.at_limit}
 
     # -- checks --------------------------------------------------------------------------------------------
 
@@ -387,11 +412,6 @@ class Grid:
                 problems.append(
                     "load_model, wind_model: engine='andes' has loads and wind as impedances. Way out: "
                     "engine='native'."
-                )
-            if self.reactive_limits:
-                problems.append(
-                    "reactive_limits: the power flow of engine='andes' does not keep them. Way out: "
-                    "engine='native', or reactive_limits=False."
                 )
             problems += [
                 f"fault {fault.label}: engine='andes' takes bus faults only. Way out: engine='native'."

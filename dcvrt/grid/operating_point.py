@@ -23,6 +23,8 @@ FLAT_START_TOLERANCE = 1e-6
 """Largest residual of any equation before the fault, pu."""
 SLACK_TOLERANCE = 1e-7
 """Largest difference between the unit at the slack bus and its share, pu."""
+Q_TOLERANCE = 1e-6
+"""Reactive power beyond a limit that counts as on it, pu."""
 COLLAPSED = 0.01
 """Voltage just after clearing, pu, below which the faulted bus counts as not recovered."""
 LOST_SYNCHRONISM = np.pi
@@ -45,6 +47,8 @@ class OperatingPoint:
         How the units share the change of load, one of `redispatch.RULES`.
     where : str
         What messages call the operating point.
+    set_points : mapping of bus to pu, optional
+        Voltages held instead of those of the case: where a unit at its reactive limit cannot hold its own.
 
     Raises
     ------
@@ -63,6 +67,7 @@ class OperatingPoint:
         faults: Sequence[BusFault],
         rule: str,
         where: str,
+        set_points: Mapping[int, float] | None = None,
     ) -> None:
         self.system, self.where = system, where
         base = float(system.config.mva)
@@ -85,6 +90,8 @@ class OperatingPoint:
             reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
             system.PQ.p0.v[:loads] *= load_scale
             system.PQ.q0.v[:loads] *= load_scale
+            for k, bus in enumerate(system.PV.bus.v):
+                system.PV.v0.v[k] = (set_points or {}).get(bus, system.PV.v0.v[k])
             self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
             self._initialise(said)
 
@@ -115,7 +122,9 @@ class OperatingPoint:
         self.beyond_q_limits = tuple(
             int(unit.bus.v[k])
             for unit in units
-            for k in np.flatnonzero((unit.q.v > unit.qmax.v) | (unit.q.v < unit.qmin.v))
+            for k in np.flatnonzero(
+                (unit.q.v > unit.qmax.v + Q_TOLERANCE) | (unit.q.v < unit.qmin.v - Q_TOLERANCE)
+            )
         )
         if not (slack.p.v >= 0).all() or not (slack.p.v <= slack.pmax.v).all():
             raise SimulationError(

@@ -42,7 +42,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     request : mapping of plain data
-        `case`, `dynamics`, `sites`, `pf`, `redispatch`, `step_s`, `t_end_s`: the grid;
+        `case`, `dynamics`, `sites`, `pf`, `redispatch`, `reactive_limits`, `step_s`, `t_end_s`: the grid;
         `hosting`: MW by site, in the order of `sites`;
         `period`: {name, hour, load_scale, wind {bus: MW}, dc_factor};
         `faults`: [{bus, t_start_s, t_clear_ms, x_pu}];
@@ -296,11 +296,20 @@ def modes_passed(sequence: Sequence[str]) -> list[str]:
 
 def _grid_of(request: Mapping[str, Any]) -> Grid:
     sites = tuple(int(bus) for bus in request["sites"])
-    return _grid(request["case"], request["dynamics"], sites, float(request["pf"]), request["redispatch"])
+    return _grid(
+        request["case"],
+        request["dynamics"],
+        sites,
+        float(request["pf"]),
+        request["redispatch"],
+        request["reactive_limits"],
+    )
 
 
 @lru_cache(maxsize=4)
-def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, redispatch: str) -> Grid:
+def _grid(
+    case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, redispatch: str, reactive_limits: bool
+) -> Grid:
     from dcvrt.grid import Grid
 
     return Grid.from_case(
@@ -309,6 +318,7 @@ def _grid(case: str, dynamics: str | None, sites: tuple[int, ...], pf: float, re
         pf=pf,
         dynamics=dynamics,
         redispatch=redispatch,
+        reactive_limits=reactive_limits,
     )
 
 

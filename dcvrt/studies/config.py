@@ -71,6 +71,10 @@ class HostingSection(Section):
     rating_scale: Positive = Field(default=0.6, description="factor on every branch rating")
     v_min_pu: Positive = Field(default=0.94, description="lowest voltage in normal operation")
     v_max_pu: Positive = Field(default=1.06, description="highest voltage in normal operation")
+    reactive_limits: bool = Field(
+        default=True,
+        description="whether units keep within their reactive limits, in normal operation and before a fault",
+    )
 
 
 class FaultEntry(Section):

@@ -17,7 +17,7 @@ from dcvrt.planning.mechanism import mechanism
 from dcvrt.planning.sampling import sample_hosting
 from dcvrt.studies import phases
 from dcvrt.studies.campaign import Campaign
-from dcvrt.studies.phases import FRONTIER, REPLAYS, Job, Setting
+from dcvrt.studies.phases import CANDIDATES, FRONTIER, Job, Setting
 from dcvrt.studies.store import Store, records
 from dcvrt.waveform import Waveform
 
@@ -47,7 +47,7 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
         asked.simulate,
         asked.replay,
         Options(gain=f.gain, trust=f.trust, candidates=f.candidates),
-        lambda ended, total: progress("frontier", ended, total, 0),
+        lambda ended, total: progress("searches", ended, total, 0),
     )
     rows = [_plan_row(setting, one) for one in found]
     checked: dict[str, dict[str, Any]] = {}
@@ -110,9 +110,8 @@ def _mechanism(store: Store, setting: Setting, plan: Mapping[str, Any], item: Ma
 
 
 def _state(store: Store) -> str:
-    """Digest of what a frontier is made from: its tasks with their states, and the plans of the other
-    methods."""
-    tasks = [(t["hash"], t["status"]) for t in records(store.tasks()) if t["phase"] in (FRONTIER, REPLAYS)]
+    """Digest of what a frontier is made from: its tasks with their states, and of its plans."""
+    tasks = [(t["hash"], t["status"]) for t in records(store.tasks()) if t["phase"] in (FRONTIER, CANDIDATES)]
     found = [p["hosting"] for p in records(store.plans()) if p["method"] == METHOD]
     return hashlib.sha256(json.dumps([sorted(tasks), found]).encode()).hexdigest()
 
@@ -166,7 +165,7 @@ class _Campaign:
         for ask, _ in questions:
             self._enter(ask, "p", "candidate")
         plans = [(self._name(ask, "p"), ask.H, list(runs)) for ask, runs in questions]
-        self.lost += phases.replay_plans(self.campaign, self.setting, plans)
+        self.lost += phases.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
         return [
             [row for row in records(store.margins(hosting=name)) if (row["mode"], row["beta"]) in runs]
             for name, _, runs in plans

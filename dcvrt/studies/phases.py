@@ -24,7 +24,9 @@ from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.store import Store, records
 
-SAMPLES, FRONTIER, REPLAYS = "samples", "frontier", "replays"
+SAMPLES, FRONTIER, CANDIDATES, REPLAYS = "samples", "frontier", "candidates", "replays"
+"""What is simulated: samples of the fits; points of the frontier's search; its candidates, by the engine of
+the replay; plans of the other methods."""
 NO_VRT = "none"
 """Method of the plan without ride-through."""
 REACTIVE = "reactive"
@@ -95,6 +97,7 @@ class Setting:
             "sites": list(self.sites),
             "pf": self.file.hosting.pf,
             "redispatch": grid.redispatch,
+            "reactive_limits": self.file.hosting.reactive_limits,
             "step_s": grid.step_s,
             "t_end_s": grid.t_end_s,
             "hosting": [float(mw) for mw in hosting],
@@ -173,6 +176,7 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     lost = replay_plans(
         campaign,
         setting,
+        REPLAYS,
         [
             (name, H, missing)
             for name, (H, runs) in wanted.items()
@@ -209,6 +213,7 @@ class Job:
 def replay_plans(
     campaign: Campaign,
     setting: Setting,
+    phase: str,
     plans: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]],
 ) -> list[str]:
     """Replay hosting vectors, (name, capacities, modes and ratings), in every period under every fault."""
@@ -218,7 +223,7 @@ def replay_plans(
         for period in setting.periods
         for name, H, runs in plans
     ]
-    return simulate(campaign, REPLAYS, jobs)
+    return simulate(campaign, phase, jobs)
 
 
 def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:
@@ -367,11 +372,7 @@ def run_plans(store: Store, setting: Setting, fits: Sequence[Surrogate], progres
             checked[row["hosting"]] = power_flow(setting.problem, plan)
         row |= checked[row["hosting"]]
     with store.transaction():
-        store.clear("plans")
-        store.put(
-            "hostings",
-            [plan_hosting(row) for row in rows],
-        )
+        store.put("hostings", [plan_hosting(row) for row in rows])
         store.put("plans", rows)
         store.note(plans_from=digest)
 

@@ -27,6 +27,7 @@ def request(hosting: np.ndarray, runs: list = RUNS, gradients: bool = True, **ch
         "sites": list(SITES),
         "pf": 0.98,
         "redispatch": "proportional",
+        "reactive_limits": True,
         "step_s": 1 / 120,
         "t_end_s": 1.2,
         "engine": "native",

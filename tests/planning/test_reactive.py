@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cmath
 import math
-import time
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -129,12 +128,3 @@ def test_sentence_says_how_many_where_and_when() -> None:
     assert ReactiveExcess(Beyond(), Beyond(1, 5, 1.5, 8, 5))
     assert not ReactiveExcess()
     assert ReactiveExcess.of(asdict(some)) == some
-
-
-def test_the_year_takes_a_fraction_of_a_second() -> None:
-    problem = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, reactive_limits=False)
-    base = problem.ac.base
-    begin = time.process_time()
-    found = problem.ac.reactive_excess(np.zeros(len(SITES)), base, np.arange(len(YEAR)))
-    assert time.process_time() - begin < 0.3
-    assert found == problem.ac.reactive_unhosted

@@ -154,6 +154,7 @@ def test_values_that_no_run_takes_are_refused_before_the_first_task(tmp_path: Pa
         "dynamics": None,
         "sites": [21],
         "redispatch": "proportional",
+        "reactive_limits": True,
         "engine": "native",
         "gradients": False,
         "runs": [["gfl", 1.0], ["gfl", 9.0]],
@@ -196,6 +197,7 @@ def test_a_study_on_one_and_two_workers_and_after_a_kill_gives_the_same(tmp_path
     file = small(tmp_path)
     one = Study.load(file).run(tmp_path / "one", workers=1)
     assert one.complete
+    finished_first = finished(tmp_path / "one", seconds=True)
 
     command = [sys.executable, "-m", "dcvrt.cli", "study", "run", str(file)]
     command += ["--out", str(tmp_path / "two"), "--workers", "2"]
@@ -228,6 +230,11 @@ def test_a_study_on_one_and_two_workers_and_after_a_kill_gives_the_same(tmp_path
     check_summary(a)
     stored = json.loads((tmp_path / "one" / "summary.json").read_text())
     assert stored == a
+    Study.load(file).run(tmp_path / "one", workers=1)
+    with Store(tmp_path / "one" / "study.sqlite") as s:
+        assert not [t for t in records(s.tasks()) if t["status"] != "done"]
+        again = {(t["hash"], t["seconds"]) for t in records(s.tasks())}
+    assert again == finished_first, "a finished study asked for more simulations"
     for name in ("table.csv", "validation.csv", "study.toml", "report.html"):
         assert (tmp_path / "one" / name).stat().st_size > 0
 

@@ -110,7 +110,7 @@ def _warnings(findings: Findings) -> Safe:
         )
     reactive = caveats.reactive_limits(findings)
     if reactive:
-        boxes.append(notice("Reactive limits of the units are not enforced", bullets(reactive)))
+        boxes.append(notice("Units beyond their reactive limits", bullets(reactive)))
     counts = findings.summary["simulations"]
     if counts["failed"] or counts["quarantined"]:
         boxes.append(

@@ -63,8 +63,11 @@ def assumptions(findings: Findings) -> Safe:
             ("Normal voltages", f"{h.v_min_pu:g} to {h.v_max_pu:g} pu in every hour."),
             (
                 "Reactive power",
-                "Generators hold their voltages; their reactive limits are not enforced, neither in the "
-                "power flow of the plans nor in the fault simulation.",
+                "Generators hold their voltages as far as their reactive limits let them, in the power flow "
+                "of the plans and before every fault; at the slack bus the limits are not enforced."
+                if h.reactive_limits
+                else "Generators hold their voltages; their reactive limits are not enforced, neither in the "
+                "power flow of the plans nor before the faults.",
             ),
             *[(f"Hours: {name}", text) for name, text in findings.provenance.get("sources", {}).items()],
             ("Phases", "Positive sequence only. A compliance verdict on the worst phase can differ."),

@@ -141,8 +141,12 @@ def plans(findings: Findings) -> Safe:
             "The replay simulates every fault in every period with every facility of the plan. A negative "
             "margin is a failure. The aggregate loss is the largest sum of the sites' lost import in one "
             "fault. The AC power flow covers every hour; the error is that of the linear voltage screen "
-            "near a limit. It holds the voltages of the units whatever reactive power that takes; the last "
-            "columns say how far this goes beyond their limits, which are not enforced."
+            "near a limit. The last columns say how far units are beyond their reactive limits: "
+            + (
+                "only those at the slack bus can be."
+                if findings.study.hosting.reactive_limits
+                else "these are not enforced, the voltages of the units are held whatever that takes."
+            )
         ),
         table("Checks of each plan", check_head, checks, words=[2, 3, 7], marked=marked),
         paragraph(loaded[0]),

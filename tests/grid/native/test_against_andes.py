@@ -106,6 +106,30 @@ def test_twelve_faults_of_the_large_case(grid: Grid) -> None:
 
 
 @pytest.mark.slow
+def test_a_fault_with_units_at_their_reactive_limits(grid: Grid) -> None:
+    """Both engines start with the same units at a limit and none beyond, and stay together in the fault."""
+    limited, fault = replace(grid, reactive_limits=True), BusFault(77)
+    hosting = {bus: 0.7 * mw for bus, mw in NO_VRT.items()}
+    start = limited.operating_point(hosting, WINDY)
+    assert start.beyond_q_limits == ()
+    at_limit = limited.native.point(hosting, WINDY).steady.at_limit
+    assert len(at_limit) > 5
+    assert len(grid.operating_point(hosting, WINDY).beyond_q_limits) > 5
+    units = limited.network.generators
+    limits = dict(zip(units.bus.tolist(), zip(units.q_min, units.q_max, strict=True), strict=True))
+    for bus in at_limit:
+        assert min(abs(start.generation[bus].imag - q) for q in limits[bus]) < 1e-3, bus
+    theirs, ours = (
+        limited.waveforms_of(hosting, WINDY, [fault], until=1.5, engine=engine)[fault]
+        for engine in ("andes", "native")
+    )
+    before, during, after = errors(theirs, ours, fault)
+    assert before < 2e-7
+    assert during < 4e-4
+    assert after < 1e-3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kundur", "ieee39"])
 def test_faults_of_other_cases(name: str) -> None:
     path, sites, bus = CASES[name]
