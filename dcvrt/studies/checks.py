@@ -113,6 +113,11 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                     f"{needed} are needed. Way out: raise sampling.n or lower sampling.validation_share."
                 )
         frontier: FrontierSection | None = sections.get("frontier")
+        if sampling is not None and sampling.gradients and grid.engine == "andes":
+            problems.append(
+                "sampling.gradients = true: grid.engine = 'andes' gives none. Way out: "
+                "grid.engine = 'native'."
+            )
         if frontier is not None and frontier.search and grid.engine == "andes":
             problems.append(
                 "frontier.search = true: needs gradients, which grid.engine = 'andes' does not give. "

@@ -135,6 +135,10 @@ class SamplingSection(Section):
 
     n: int = Field(default=24, ge=6, le=4096, description="number of hosting vectors")
     validation_share: Share = Field(default=0.25, description="share of them kept out of the fit")
+    gradients: bool = Field(
+        default=False,
+        description="derivatives of the sampled margins too, for margins as the least of affine pieces",
+    )
     high_share: float = Field(
         default=0.5, ge=0, le=1, description="share of them drawn from the high-capacity region"
     )

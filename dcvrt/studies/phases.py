@@ -11,18 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dcvrt.errors import DcvrtError, InputError
 from dcvrt.planning import replay
 from dcvrt.planning.hosting import HostingProblem
-from dcvrt.planning.kept import one_sided
+from dcvrt.planning.kept import one_sided, side_by_side
 from dcvrt.planning.plan import Plan
 from dcvrt.planning.sampling import Samples, sample_hosting
-from dcvrt.planning.surrogate import MarginData, Surrogate, fit_surrogates
+from dcvrt.planning.surrogate import TARGETS, MarginData, Surrogate, fit_surrogates
 from dcvrt.planning.sweep import sweep
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.store import Store, records
+
+Floats = npt.NDArray[np.float64]
 
 SAMPLES, FRONTIER, CANDIDATES, REPLAYS = "samples", "frontier", "candidates", "replays"
 """What is simulated: samples of the fits; points of the frontier's search; its candidates, by the engine of
@@ -154,9 +157,9 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
             ],
         )
         store.note(sampled_box_mw=dict(zip(map(str, setting.sites), samples.upper.tolist(), strict=True)))
-    engine = setting.file.grid.engine
+    engine, gradients = setting.file.grid.engine, setting.file.sampling.gradients
     jobs = [
-        Job(f"s{k:04}", setting.request(H, period, setting.runs, engine=engine))
+        Job(f"s{k:04}", setting.request(H, period, setting.runs, engine=engine, gradients=gradients))
         for period in setting.periods
         for k, H in enumerate(samples.hosting.tolist())
     ]
@@ -252,11 +255,16 @@ def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:
 # -- fits ----------------------------------------------------------------------------------------------------
 
 
-def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> MarginData:
-    """The checked runs of the samples as arrays."""
+def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> tuple[MarginData, Floats]:
+    """The checked runs of the samples as arrays, and the derivatives of voltage margin and loss share by
+    every site's capacity, (runs, 2, sites), NaN where they were not asked for."""
     frame = store.margins("sample")
     if frame.empty:
         raise InputError(f"{store.path}: holds no sampled runs. Way out: run the study first.")
+    slopes = np.full((len(frame), 2, len(sites)), np.nan)
+    for k, gradients in enumerate(frame.gradients):
+        if gradients:
+            slopes[k] = [[gradients[target][f"H_{bus}"] for bus in sites] for target in TARGETS]
     samples = store.hostings().set_index("name")
     vectors = {name: [by_site[str(bus)] for bus in sites] for name, by_site in samples.by_site.items()}
     return MarginData(
@@ -276,16 +284,17 @@ def margin_data(store: Store, sites: Sequence[int], d: Mapping[str, float]) -> M
         sequence=frame.sequence.to_numpy(dtype=str),
         fit=(samples.subset[frame.hosting] == "fit").to_numpy(dtype=bool),
         name=frame.hosting.to_numpy(dtype=str),
-    )
+    ), slopes
 
 
 def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
     """Fit every method to the samples and write surrogates and validation points."""
-    data = margin_data(store, setting.sites, setting.d)
+    data, slopes = margin_data(store, setting.sites, setting.d)
     fits = [fit for method in setting.file.surrogate.methods for fit in fit_surrogates(data, method)]
     with store.transaction():
         store.clear("surrogates", "predictions")
         store.note(one_sided=one_sided(data))
+        judge_forms(store, data, slopes if setting.file.sampling.gradients else None)
         for fit in fits:
             key = {
                 name: getattr(fit, name)
@@ -322,6 +331,13 @@ def run_fits(store: Store, setting: Setting) -> list[Surrogate]:
                 ],
             )
     return fits
+
+
+def judge_forms(store: Store, data: MarginData, slopes: Floats | None) -> None:
+    """Note how much of what is feasible each form of the margins keeps, unless it stands there already."""
+    made_from = hashlib.sha256(data.voltage.tobytes() + data.loss_share.tobytes()).hexdigest()
+    if store.provenance().get("forms_from") != made_from and not data.fit.all():
+        store.note(forms_from=made_from, forms=[asdict(found) for found in side_by_side(data, slopes)])
 
 
 # -- plans ---------------------------------------------------------------------------------------------------

@@ -253,6 +253,15 @@ def test_fields_that_contradict_each_other() -> None:
     ]
 
 
+def test_derivatives_of_an_engine_that_has_none() -> None:
+    text = changed(('engine = "native"  ', 'engine = "andes"  '), ("gradients = false", "gradients = true"))
+    assert complaint(text).splitlines()[1:] == [
+        "  sampling.gradients = true: grid.engine = 'andes' gives none. Way out: grid.engine = 'native'.",
+        "  frontier.search = true: needs gradients, which grid.engine = 'andes' does not give. Way out: "
+        "grid.engine = 'native', or search = false.",
+    ]
+
+
 def test_case_without_dynamic_data(tmp_path: Path) -> None:
     (tmp_path / "north.raw").write_text("0, 100.0\n")
     assert complaint(changed(('case = "ieee118"', 'case = "north.raw"')), tmp_path) == (

@@ -312,3 +312,20 @@ def test_every_deviation_of_the_models_is_listed(folder: Path, page: Page) -> No
     for mode in findings.modes:
         for note in findings.facility(mode).notes:
             assert re.sub(r"\s+", " ", note.partition(": ")[2]) in page.text
+
+
+def test_forms_of_the_margins_stand_side_by_side(tmp_path: Path) -> None:
+    """Counts of the store, and of what a form keeps: never more than is feasible."""
+    folder = make(tmp_path / "forms")
+    with Store(folder / "study.sqlite") as store:
+        forms = {form["method"]: form for form in store.provenance()["forms"]}
+    assert list(forms) == ["paper", "share", "bound"]
+    assert len({form["feasible"] for form in forms.values()}) == 1
+    assert all(0 <= form["kept"] <= form["feasible"] for form in forms.values())
+    assert forms["bound"]["kept"] > 0
+    write_report(folder)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    table = page[page.index("What each form keeps of what is feasible") :]
+    for form in forms.values():
+        assert f">{form['kept']}</td>" in table[table.index(f">{form['method']}<") :]
+    assert "judged too with sampling.gradients = true" in page
