@@ -31,7 +31,7 @@ SITES = (21, 75, 106, 108)
 SCALE = 0.6
 LIMITS = (0.94, 1.06)
 LARGE = ("case300_ieee", "case1354_pegase", "case2869_pegase", "case9241_pegase")
-WITH_VOLTAGES = "case1354_pegase"
+WITH_VOLTAGES = LARGE[:3]
 RANDOM_CASES = 16
 
 
@@ -240,7 +240,7 @@ def large(smoke: bool) -> list[Result]:
     for name in LARGE:
         network = Network.from_matpower(Path(spec.origin).parent / "opf" / f"pglib_opf_{name}.m")
         rows += _large(network, profiles.ieee118({}))
-        if name == WITH_VOLTAGES:
+        if name in WITH_VOLTAGES:
             rows += _large_with_voltages(network, profiles.ieee118({}).window(range(8400, 8448)))
     return rows
 

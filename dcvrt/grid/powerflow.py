@@ -612,13 +612,30 @@ class PowerFlow:
                     if abs(rest).max() <= 1e-8 * size:
                         break
                     x -= steering.step(rest, ag)
-                else:
-                    raise SimulationError(
-                        f"{self.network.name}: voltage sensitivities did not settle; the operating "
-                        "points lie close to the limit of power transfer. Way out: host less."
-                    )
+                else:  # close to the limit of power transfer one Jacobian no longer steers all hours
+                    for k in range(len(group)):
+                        x[:, k] = self._exactly(vg[:, k], ag[:, k], right[:, k])
                 result[:, group, j] = x[n:]
         return result
+
+    def _exactly(self, v: Phasors, limited: Limited, right: Floats) -> Floats:
+        """Moves of angles and sizes for residuals of one hour, from its own Jacobian."""
+        n, m = len(self.free), len(self.pq)
+        unheld = np.flatnonzero(limited)
+        rows = np.r_[np.arange(n + m), n + m + unheld]
+        jacobian = self._jacobian(v, np.r_[self.pq, self.pv[unheld]])
+        x = np.zeros(len(right))
+        try:
+            if isinstance(jacobian, np.ndarray):
+                x[rows] = np.linalg.solve(jacobian, right[rows])
+            else:
+                x[rows] = spla.splu(jacobian).solve(right[rows])
+        except (RuntimeError, np.linalg.LinAlgError):
+            raise SimulationError(
+                f"{self.network.name}: an operating point lies at the limit of power transfer, where "
+                "voltages have no derivative. Way out: host less."
+            ) from None
+        return x
 
 
 def hosting_directions(network: Network, sites: Sequence[int] | Integers, pf: float) -> Phasors:

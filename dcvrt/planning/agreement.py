@@ -34,6 +34,8 @@ screen proves wrong by half of it somewhere."""
 STEEP = 3e-4
 """Hours closer to a limit than this get new slopes, pu."""
 PASSES = 40
+HALVINGS = 10
+"""Halved steps towards sizes without a solution before they count as out of reach."""
 
 
 class Agreement:
@@ -53,9 +55,40 @@ class Agreement:
         self.guard = GUARD
         self.error, self.lowest, self.highest = 0.0, np.nan, np.nan
         self.least_room = np.zeros(0)
+        self._solvable = np.zeros(screen.slope.shape[-1])
 
     def reached(self, solution: Solution, master: Master) -> bool:
         """Compare at the optimum; if they differ, linearise again and renew the cuts of `master`."""
+        try:
+            agrees = self._compare(solution, master)
+        except SimulationError:
+            if not self.repeat:
+                raise
+            self._retreat(solution.H, master)
+            return False
+        self._solvable = solution.H
+        return agrees
+
+    def _retreat(self, H: Floats, master: Master) -> None:
+        """Where AC power flow has no solution, linearise on the way there from the last sizes that had one.
+
+        Beyond the limit of power transfer there is nothing to linearise; before it voltages fall steeper and
+        steeper, so that the tangents there cut off what lies beyond.
+        """
+        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        for halvings in range(1, HALVINGS + 1):
+            nearer = self._solvable + (H - self._solvable) / 2**halvings
+            try:
+                look = self._look(nearer, tangents)
+            except SimulationError:
+                if halvings == HALVINGS:
+                    raise
+                continue
+            self._solvable = nearer
+            self._move(nearer, look, master)
+            return
+
+    def _compare(self, solution: Solution, master: Master) -> bool:
         tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
         if self.repeat and tangents:
             first = self._glance(solution.H, tangents)

@@ -18,6 +18,9 @@ Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 TOLERANCE_MW = 1e-6
+"""Violation that is let pass, MW."""
+TOLERANCE_SHARE = 1e-10
+"""The same over the largest demand, where that is more: below it a dispatch programme can't tell."""
 KNOWN_DISPATCHES = 60
 IDLE = 10
 """Known dispatches in a row that serve no hour before programmes are solved."""
@@ -108,7 +111,9 @@ class Hours:
         self._known = [_Known(np.full(len(network.generators), float(np.clip(share, 0.0, 1.0))))]
         self._watched = np.zeros(0, dtype=np.int64)
         self._failed: dict[int, None] = {}
-        self.certificate = Certificate(0, 0, 0, TOLERANCE_MW)
+        self.tolerance = max(TOLERANCE_MW, TOLERANCE_SHARE * float(self._demand.max(initial=0.0)))
+        """Violation of any limit that is let pass, MW."""
+        self.certificate = Certificate(0, 0, 0, self.tolerance)
 
     def bound(self, cut: FlowCut, hours: Integers | None = None) -> Floats:
         """Right-hand side of `-pi_C . H <= b` that a cut gives in each corner hour, MW of hosted load."""
@@ -168,7 +173,7 @@ class Hours:
             first, todo = int(todo[0]), todo[1:]
             found = self.dispatch(H, int(self.corners[first]))
             known = self._remember(found.units, int(self.corners[first]))
-            if found.shortfall > TOLERANCE_MW:
+            if found.shortfall > self.tolerance:
                 assert found.cut is not None
                 self._failed[first] = None
                 return found.cut
@@ -177,7 +182,7 @@ class Hours:
             scaled += int(served.sum())
             todo = todo[~served]
         combination = len(self.year) - len(self.corners)
-        self.certificate = Certificate(scaled, programme, combination, TOLERANCE_MW)
+        self.certificate = Certificate(scaled, programme, combination, self.tolerance)
         return None
 
     def _remember(self, units: Floats, hour: int) -> _Known:
@@ -207,7 +212,7 @@ class Hours:
             base, more, less = (f[rows] if f.shape[1] == 1 else f[rows][:, hours] for f in flows)
             flow = self._flow[rows][:, at[hours]] - np.outer(site[rows], self._dc[at[hours]])
             flow = flow + base + more * up[hours] + less * down[hours]
-            limit = self.network.branches.rating[rows, None] + 1e-2 * TOLERANCE_MW
+            limit = self.network.branches.rating[rows, None] + 1e-2 * self.tolerance
             return np.asarray((abs(flow) <= limit).all(axis=0)), flow
 
         hours = np.flatnonzero((up <= 1.0) & (down >= -1.0))
@@ -221,7 +226,7 @@ class Hours:
                 broken = (abs(flow) - self.network.branches.rating[:, None]).argmax(axis=0)[~ok]
                 self._watched = np.union1d(self._watched, broken)
                 hours = hours[within(self._watched, hours)[0]] if len(hours) else hours
-            ok[ok] = self.outages.survived(flow[:, ok], 1e-2 * TOLERANCE_MW)
+            ok[ok] = self.outages.survived(flow[:, ok], 1e-2 * self.tolerance)
             good[now[ok]] = True
         return good
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.planning.agreement import NEAR
-from dcvrt.planning.certificate import TOLERANCE_MW, Hours
+from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import INTACT, FlowCut
 from dcvrt.planning.master import Master, Solution
 from dcvrt.planning.plan import AcVerdict, Binding, Certificate, Plan, VoltageInfo
@@ -278,11 +278,11 @@ def base_case(hours: Hours, rating_scale: float) -> str:
         at = int(todo[0])
         found = hours.dispatch(nothing, at)
         spent += 1
-        if found.cut is not None and found.shortfall > TOLERANCE_MW:
+        if found.cut is not None and found.shortfall > hours.tolerance:
             if worst is None or found.shortfall > worst[0]:
                 worst = found.shortfall, at, found.cut
             least = hours.shortfall(found.cut, todo)
-            lost = least > TOLERANCE_MW
+            lost = least > hours.tolerance
             lost[0] = True
             short.update({int(t): float(mw) for t, mw in zip(todo[lost], least[lost], strict=True)})
             todo = todo[~lost]

@@ -12,6 +12,7 @@ import pytest
 from dcvrt.errors import InfeasibleError, InputError
 from dcvrt.grid.network import Network
 from dcvrt.planning import HostingProblem, Row, profiles
+from tests.grid.native.cases import network
 from tests.planning.test_hosting import solve_file
 
 SITES = (21, 75, 106, 108)
@@ -320,3 +321,21 @@ def test_hours_outside_the_problem_are_refused(problem: HostingProblem, tmp_path
     with pytest.raises(InputError) as error:
         problem.write_mps(tmp_path / "check.mps", hours=range(10))
     assert str(error.value) == "hour 0 is not among the 24 operating hours (8424 to 8447)."
+
+
+@pytest.mark.parametrize(("v_min", "x"), [(0.9, 0.5), (0.75, 0.5), (0.95, 0.2)])
+def test_a_proposal_beyond_the_nose_is_left_for_the_voltage_limit(v_min: float, x: float) -> None:
+    """One line x from a stiff source to a site at unity power factor: V^2 = (1 + sqrt(1 - (2 P x)^2))/2.
+
+    With nothing hosted the voltage does not fall at all, so the first proposal is the largest size allowed,
+    ten times what the line can carry.
+    """
+    two = network({1: "slack", 2: "pq"}, [(1, 2, complex(0.0, x))], {1: 100.0})
+    year = profiles.Year(np.arange(3), np.ones(3), {}, np.array([0.5, 1.0, 0.8]))
+    problem = HostingProblem(
+        two, (2,), year, voltage=(v_min, 1.1), pf=1.0, h_max=500.0 / x, reactive_limits=False
+    )
+    plan = problem.solve()
+    hosted = 100.0 * np.sqrt(1.0 - (2.0 * v_min**2 - 1.0) ** 2) / (2.0 * x)
+    assert plan.total_mw == pytest.approx(hosted, rel=1e-5)
+    assert problem.check_ac(plan).passed
