@@ -26,7 +26,7 @@ IDLE = 10
 """Known dispatches in a row that serve no hour before programmes are solved."""
 BLOCK = 2_000_000
 """Flows looked at together, so that large networks stay small in memory."""
-HULL_FROM = 400
+HULL_FROM = 1000
 """Hours from which the convex hull is worth its computation."""
 HULL_DIMENSIONS = 6
 """Parameters up to which the hull has far fewer vertices than there are hours."""
