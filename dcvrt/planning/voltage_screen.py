@@ -19,6 +19,10 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+MOST_KEPT = 4
+"""Capacities whose voltages are kept to start from."""
+SAME = 1e-6
+"""Difference of capacities that counts as none, MW."""
 BUSES_A_ROUND = 4
 """Buses whose violated limits become cuts together."""
 
@@ -68,7 +72,7 @@ class HostedFlow:
         self.change = hosting_directions(network, sites, pf)
         self.scheduled = injections(network, year.load, year.wind)
         self._all = np.arange(len(year))
-        self._latest: HourlySolution | None = None  # the next capacities are mostly near the last ones
+        self._solved: list[tuple[Floats, HourlySolution]] = []
 
     @cached_property
     def unhosted(self) -> HourlySolution:
@@ -83,19 +87,34 @@ class HostedFlow:
     def solve(self, H: Floats, hours: Integers | None = None) -> HourlySolution:
         """AC power flow at `H` of the hours at the given positions (default all)."""
         at = self._all if hours is None else hours
-        base = self.unhosted
-        if self._latest is None:
-            self._latest = replace(base, v=base.v.copy(), limited=base.limited.copy())
-        latest = self._latest
+        base, known = self.unhosted, self._known(H)
         solved = self.flow.solve_hours(
             self._demand(H, at),
-            start=latest.v[:, at],
+            start=known.v[:, at],
             hours=self.year.hours[at],
-            limited=latest.limited[:, at],
+            limited=known.limited[:, at],
         )
-        latest.v[:, at] = np.where(solved.converged, solved.v, base.v[:, at])
-        latest.limited[:, at] = np.where(solved.converged, solved.limited, base.limited[:, at])
+        if H.any():
+            known.v[:, at] = np.where(solved.converged, solved.v, base.v[:, at])
+            known.limited[:, at] = np.where(solved.converged, solved.limited, base.limited[:, at])
         return solved
+
+    def _known(self, H: Floats) -> HourlySolution:
+        """Where to start: what was last solved at `H`, a copy of what is known nearest to it otherwise.
+
+        A search comes back to the same capacities again and again.
+        """
+        if not H.any():
+            return self.unhosted
+        far = [float(abs(H - other).max()) for other, _ in self._solved]
+        nearest = int(np.argmin(far)) if far and min(far) < abs(H).max() else None
+        if nearest is not None and far[nearest] <= SAME:
+            self._solved.append(self._solved.pop(nearest))
+            return self._solved[-1][1]
+        start = self.unhosted if nearest is None else self._solved[nearest][1]
+        fresh = replace(start, v=start.v.copy(), limited=start.limited.copy())
+        self._solved = [*self._solved[1 - MOST_KEPT :], (H.copy(), fresh)]
+        return fresh
 
     def _demand(self, H: Floats, at: Integers) -> npt.NDArray[np.complex128]:
         """Scheduled injections at `H`, MVA, (buses, hours)."""

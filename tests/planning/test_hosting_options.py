@@ -149,8 +149,8 @@ def test_unit_limits_of_the_hour_equal_the_monolith(tmp_path: Path) -> None:
 
 
 def test_corner_hours_count_unit_limits_as_parameters() -> None:
-    whole = profiles.ieee118({}).window(range(8000, 8600))
-    year = replace(whole, p_max={"G10": 300 + 200 * np.cos(np.arange(600) / 9.0)})
+    whole = profiles.ieee118({}).window(range(7400, 8600))
+    year = replace(whole, p_max={"G10": 300 + 200 * np.cos(np.arange(1200) / 9.0)})
     short, full = (HostingProblem(NETWORK, SITES, year, 0.55, None, hull=hull) for hull in (True, False))
     assert short.solve().total_mw == pytest.approx(full.solve().total_mw, rel=1e-9)
     assert short.solve().certificate.combination > 0
