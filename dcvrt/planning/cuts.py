@@ -2,10 +2,11 @@ r"""Cuts from exact margins: what is known about a mode at a rating, as rows of 
 
 A simulated margin with its total gradient gives the tangent
 
-.. math:: m(H^k) + \nabla m(H^k) \cdot (H - H^k) \ge e
+.. math:: m(H^k) + \nabla m(H^k) \cdot (H - H^k) \ge e\, p(H)
 
-for its site, where e is the allowance by which the replay has been seen to find less, and a little more than
-that. Nothing is assumed about the shape of margins: a tangent that excludes a hosting vector whose margin is
+where e is the allowance by which the replay has been seen to find less, and a little more than that, as a
+share of the size p of the margin. The row of a margin that belongs to a site holds while the site is open.
+Nothing is assumed about the shape of margins: a tangent that excludes a hosting vector whose margin is
 known to be met is wrong there, and is dropped; where the tangent belongs to a point that fails, a cut at the
 last passing point of the segment between the two takes its place (`Separation`).
 """
@@ -18,18 +19,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.planning.exact import TARGETS, UNITS, Exact, Key, Place, Run
+from dcvrt.planning.exact import Exact, Place, Run
 from dcvrt.planning.plan import Row
+from dcvrt.planning.requirement import Margins, Requirement
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Key = tuple[str, str, int]
+"""Period, fault and number of a margin of the requirement: what one margin is the margin of."""
 
 NEVER_BINDS = 1e-9
 """Slack, in the unit of the margin, by which a row that holds all over the box is told from one that may
 bind."""
 BACKOFF = 1e-5
-"""What a tangent asks for beyond the margin, pu or share, so that a plan on it passes in spite of its
-curvature."""
+"""What a tangent asks for beyond the margin, as a share of its size, so that a plan on it passes in spite of
+its curvature."""
 SETTLED = 2e-3
 """Distance within which a plan takes the capacities of a simulated point, MW: the hosting programme itself
 knows its optimum no better, as voltages agree with AC power flow to 1e-7 pu."""
@@ -62,59 +66,77 @@ class Separation:
 
 @dataclass(eq=False)
 class Knowledge:
-    """All that was simulated about one mode at one rating.
+    """All that was simulated about one mode at one rating, as margins of a requirement.
 
     Attributes
     ----------
-    sites : candidate buses.
+    requirement : what has to be met.
     run : mode and rating ratio.
-    exact : simulated margins by period and fault, in the order in which they were made.
-    allowance : by margin, how much less the replay has found; 0 where it is not named.
+    points : margins by period and fault, in the order in which they were simulated.
+    allowance : by margin, how much less the replay has found, as a share of its size; 0 where it is not named.
     separations : cuts at changes of the event sequence.
     """
 
-    sites: tuple[int, ...]
+    requirement: Requirement
     run: Run
-    exact: dict[Place, list[Exact]] = field(default_factory=dict)
+    points: dict[Place, list[Margins]] = field(default_factory=dict)
     allowance: dict[Key, float] = field(default_factory=dict)
     separations: list[Separation] = field(default_factory=list)
 
-    def learn(self, found: Sequence[Exact]) -> None:
-        """Take in simulated margins."""
-        for one in found:
-            self.exact.setdefault(one.place, []).append(one)
+    @property
+    def sites(self) -> tuple[int, ...]:
+        """Candidate buses."""
+        return self.requirement.sites
 
-    def at(self, H: Floats) -> dict[Place, Exact]:
+    def learn(self, found: Sequence[Exact]) -> None:
+        """Take in what was simulated, where it is new."""
+        for one in found:
+            known = self.points.setdefault(one.place, [])
+            if not any(same(one.H, other.H) for other in known):
+                known.append(self.requirement.margins(one))
+
+    def at(self, H: Floats) -> dict[Place, Margins]:
         """What was simulated at a hosting vector itself."""
-        return {place: one for place, points in self.exact.items() for one in points if same(one.H, H)}
+        return {place: one for place, points in self.points.items() for one in points if same(one.H, H)}
 
     def settle(self, H: Floats) -> Floats:
         """A simulated point that the hosting programme cannot tell from a plan, or the plan itself."""
-        points = [one.H for known in self.exact.values() for one in known]
+        points = [one.H for known in self.points.values() for one in known]
         near = [
             point for point in points if abs(point - H).max() <= SETTLED and ((point > 0) == (H > 0)).all()
         ]
         return min(near, key=lambda point: float(abs(point - H).max())) if near else H
 
-    def nearest(self, place: Place, H: Floats) -> Exact:
+    def nearest(self, place: Place, H: Floats) -> Margins:
         """The simulated point of a period and fault that is nearest to a hosting vector."""
-        return min(self.exact[place], key=lambda one: float(abs(one.H - H).max()))
+        return min(self.points[place], key=lambda one: float(abs(one.H - H).max()))
 
-    def short(self, one: Exact, site: int, target: int) -> bool:
-        """Whether a margin is not met, a run without a margin included."""
-        need = self.allowance.get((*one.place, site, target), 0.0)
-        return not one.value[site, target] >= need
+    def needs(self, place: Place) -> Floats:
+        """Allowance of every margin of a period and fault, (margins,)."""
+        return np.array([self.allowance.get((*place, k), 0.0) for k in range(len(self.requirement.owners))])
 
-    def passing(self, key: Key) -> list[Exact]:
+    def missed(self, H: Floats) -> list[Key]:
+        """Margins that are not met at a point, by what was simulated there."""
+        return [(*place, k) for place, one in self.at(H).items() for k in one.missed(self.needs(place))]
+
+    def short(self, one: Margins, number: int) -> bool:
+        """Whether a margin is not met, one without a value included."""
+        need = self.allowance.get((*one.place, number), 0.0)
+        return not one.value[number] >= need * one.size[number]
+
+    def passing(self, key: Key) -> list[Margins]:
         """Points at which a margin is met."""
-        *place, site, target = key
-        return [one for one in self.exact[tuple(place)] if not self.short(one, site, target)]  # type: ignore[index]
+        period, fault, number = key
+        return [one for one in self.points[period, fault] if not self.short(one, number)]
 
     def label(self, key: Key) -> str:
         """What reports call a margin."""
-        period, fault, site, target = key
+        return f"{self.requirement.label(key[2])}, {self._where(key[:2])}"
+
+    def _where(self, place: Place) -> str:
+        period, fault = place
         mode, beta = self.run
-        return f"{TARGETS[target]} at bus {self.sites[site]}, fault {fault}, {period}, {mode}, beta {beta:g}"
+        return f"fault {fault}, {period}, {mode}, beta {beta:g}"
 
     def separated(self, key: Key, H: Floats) -> bool:
         """Whether a cut at a change of sequence excludes a point already."""
@@ -122,18 +144,16 @@ class Knowledge:
 
     # -- rows ----------------------------------------------------------------------------------------------
 
-    def unexplained(self, one: Exact, site: int, target: int) -> Exact | None:
-        """A point that meets the margin although the tangent at a failing point denies it, or None.
+    def unexplained(self, one: Margins, number: int) -> bool:
+        """Whether the tangent at a failing point denies a point that meets the margin.
 
-        The nearest such point; with None the tangent may serve as a cut.
+        If not, the tangent may serve as a cut.
         """
-        key = (*one.place, site, target)
-        met = self.passing(key)
-        if not met:
-            return None
+        key = (*one.place, number)
         need = self.allowance.get(key, 0.0)
-        denied = [q for q in met if not one.linear(q.H)[site, target] >= need]
-        return min(denied, key=lambda q: float(abs(q.H - one.H).max())) if denied else None
+        return any(
+            not one.linear(q.H)[number] >= need * q.size[number] for q in self.passing(key)
+        )
 
     def rows(self, box: Floats, centre: Floats | None = None, radius: float = np.inf) -> Iterator[Row]:
         """Rows of the hosting programme.
@@ -148,60 +168,60 @@ class Knowledge:
         radius : float
             MW.
         """
-        for place, points in self.exact.items():
-            needs = self._needs(place)
+        for place, points in self.points.items():
+            needs = self.needs(place)
+            value, slope, H = (np.array([getattr(one, name) for one in points]) for name in TANGENT)
             serving = self._serving(points, needs)
             if centre is not None:
-                serving &= self._local(points, needs, centre, radius)[:, None, None]
-            value, slope = np.array([one.value for one in points]), np.array([one.slope for one in points])
-            H = np.array([one.H for one in points])
-            lower = needs + BACKOFF - value + np.einsum("pitj,pj->pit", slope, H)
-            binds = np.einsum("pitj,j->pit", np.minimum(slope, 0.0), box) < lower + NEVER_BINDS
-            for k, site, target in zip(*np.nonzero(serving & binds), strict=True):
-                key = (*place, int(site), int(target))
-                yield self._row(slope[k, site, target], float(lower[k, site, target]), key, self.sites[site])
+                serving &= self._local(points, needs, centre, radius)[:, None]
+            more = needs + BACKOFF
+            slope = slope - more[:, None] * np.array([one.size_slope for one in points])
+            value = value - more * np.array([one.size for one in points])
+            lower = np.einsum("pmj,pj->pm", slope, H) - value
+            binds = np.einsum("pmj,j->pm", np.minimum(slope, 0.0), box) < lower + NEVER_BINDS
+            for k, number in zip(*np.nonzero(serving & binds), strict=True):
+                yield self._row(slope[k, number], float(lower[k, number]), (*place, int(number)))
         for cut in self.separations:
-            yield self._row(
-                cut.normal, float(cut.normal @ cut.passing), cut.key, self.sites[cut.key[2]], "MW"
-            )
+            yield self._row(cut.normal, float(cut.normal @ cut.passing), cut.key, by_sequence=True)
         yield from self._without_margin()
 
-    def _needs(self, place: Place) -> Floats:
-        """Allowance of every margin of a period and fault, (sites, 2)."""
-        n = len(self.sites)
-        return np.array([[self.allowance.get((*place, i, t), 0.0) for t in range(2)] for i in range(n)])
-
-    def _serving(self, points: Sequence[Exact], needs: Floats) -> Flags:
-        """Which tangents may serve as rows, (points, sites, 2): those that deny no point that meets the
+    def _serving(self, points: Sequence[Margins], needs: Floats) -> Flags:
+        """Which tangents may serve as rows, (points, margins): those that deny no point that meets the
         margin."""
-        value, slope = np.array([one.value for one in points]), np.array([one.slope for one in points])
-        H = np.array([one.H for one in points])
-        predicted = value[:, None] + np.einsum("pitj,pqj->pqit", slope, H[None] - H[:, None])
-        denied = ((value >= needs)[None] & (predicted < needs)).any(axis=1)
-        return np.asarray(np.isfinite(value) & np.isfinite(slope).all(axis=3) & ~denied)
+        value, slope, H = (np.array([getattr(one, name) for one in points]) for name in TANGENT)
+        asked = needs * np.array([one.size for one in points])
+        predicted = value[:, None] + np.einsum("pmj,pqj->pqm", slope, H[None] - H[:, None])
+        denied = ((value >= asked)[None] & (predicted < asked[None])).any(axis=1)
+        return np.asarray(np.isfinite(value) & np.isfinite(slope).all(axis=2) & ~denied)
 
-    def _local(self, points: Sequence[Exact], needs: Floats, centre: Floats, radius: float) -> Flags:
+    def _local(self, points: Sequence[Margins], needs: Floats, centre: Floats, radius: float) -> Flags:
         """Which points count around a centre: the nearest, and those within the radius that fail."""
         away = np.array([abs(one.H - centre).max() for one in points])
-        failing = np.array([bool((~(one.value >= needs)).any()) for one in points])
+        failing = np.array([bool((~(one.value >= needs * one.size)).any()) for one in points])
         return (away <= radius) & failing | (np.arange(len(points)) == away.argmin())
 
     def _without_margin(self) -> Iterator[Row]:
-        """A site at which a margin was never obtained does not pass."""
-        for place, points in self.exact.items():
-            for site, bus in enumerate(self.sites):
-                if all(np.isnan(one.value[site]).any() for one in points):
-                    key = (*place, site, 0)
-                    yield Row(
-                        {bus: 0.0}, 1.0, f"no margin known, {self.label(key)}: {points[0].status[site]}", bus
-                    )
+        """A site that is unknown wherever it was simulated does not pass."""
+        for place, points in self.points.items():
+            for site in np.flatnonzero(np.all([one.unknown for one in points], axis=0)).tolist():
+                bus, why = self.sites[site], points[0].at.status[site]
+                yield Row({bus: 0.0}, 1.0, f"no margin known, bus {bus}, {self._where(place)}: {why}", bus)
 
-    def _row(self, a: Floats, lower: float, key: Key, bus: int, unit: str = "") -> Row:
-        coefficients = dict(zip(self.sites, a.tolist(), strict=True))
-        label = self.label(key)
-        if unit == "MW":
-            label = f"{label} (by sequence)"
-        return Row(coefficients, lower, label, site=bus, unit=unit or UNITS[key[3]])
+    def _row(self, a: Floats, lower: float, key: Key, by_sequence: bool = False) -> Row:
+        owner, unit = self.requirement.owners[key[2]], self.requirement.unit(key[2])
+        if owner is None:  # nothing hosted meets it, so that no row may ask for more than that
+            lower = min(lower, 0.0)
+        return Row(
+            dict(zip(self.sites, a.tolist(), strict=True)),
+            lower,
+            f"{self.label(key)} (by sequence)" if by_sequence else self.label(key),
+            site=None if owner is None else self.sites[owner],
+            unit="MW" if by_sequence else unit,
+        )
+
+
+TANGENT = ("value", "slope", "H")
+"""Attributes of `Margins` that make a tangent."""
 
 
 def same(a: Floats, b: Floats) -> bool:
@@ -209,33 +229,21 @@ def same(a: Floats, b: Floats) -> bool:
     return bool(abs(a - b).max() < SAME_POINT)
 
 
-def separation(knowledge: Knowledge, key: Key, passing: Exact, failing: Exact) -> Separation:
+def separation(knowledge: Knowledge, key: Key, passing: Margins, failing: Margins) -> Separation:
     """The cut between two points: across the direction in which the retained voltage changes.
 
-    Supervisors act on the voltage, so its gradient at the site is the natural normal; where it does not tell
-    the two points apart, the segment between them is.
+    Supervisors act on the voltage, so its gradient at the sites whose sequence changes is the natural normal;
+    where it does not tell the two points apart, the segment between them is.
     """
-    *_, site, _ = key
+    involved = knowledge.requirement.involved(key[2])
+    changed = [i for i in involved if passing.words[i] != failing.words[i]]
     step = failing.H - passing.H
-    normal = passing.v_slope[site]
+    normal = passing.at.v_slope[changed or list(involved)].sum(axis=0)
     along = float(normal @ step) if np.isfinite(normal).all() else 0.0
     normal = -np.sign(along) * normal if abs(along) > 1e-9 else -step
-    before, after = passing.sequence[site], failing.sequence[site]
-    if not after:
-        why = failing.status[site]
-    elif after == before:
-        why = "the same modes, but the margin is no concave function of the capacities"
-    else:
-        why = f"{before} becomes {after}"
-    return Separation(key, normal / np.linalg.norm(normal), passing.H, failing.H, why)
-
-
-def worst_over(places: Mapping[Place, Exact], knowledge: Knowledge, open_sites: Sequence[int]) -> list[Key]:
-    """Margins that are not met at a point, at open sites."""
-    return [
-        (*place, site, target)
-        for place, one in places.items()
-        for site in open_sites
-        for target in range(2)
-        if knowledge.short(one, site, target)
+    named = [f"bus {knowledge.sites[i]}: " if len(involved) > 1 else "" for i in changed]
+    courses = [
+        f"{name}{passing.words[i]} becomes {failing.words[i]}" for name, i in zip(named, changed, strict=True)
     ]
+    why = "; ".join(courses) or "the same modes, but the margin is no concave function of the capacities"
+    return Separation(key, normal / np.linalg.norm(normal), passing.H, failing.H, why)

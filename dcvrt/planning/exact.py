@@ -1,4 +1,8 @@
-"""Exact margins with their total gradients: what simulated faults say about a facility mode at a rating."""
+"""Exact margins with their total gradients: what simulated faults say about a facility mode at a rating.
+
+What a plan has to meet, the margins of every site or the loss of all of them together, is made from these in
+`dcvrt.planning.requirement`.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +18,7 @@ Run = tuple[str, float]
 """Facility mode and rating ratio."""
 Place = tuple[str, str]
 """Period and fault."""
-Key = tuple[str, str, int, int]
-"""Period, fault, position of the site and of the target: what one margin is the margin of."""
-
 TARGETS = ("voltage", "loss")
-UNITS = ("pu", "share of load")
 COLUMNS = ("v_margin_pu", "loss_margin_share")
 
 
@@ -38,6 +38,9 @@ class Exact:
         Total derivative of each margin by every H_j, per MW; NaN where it was not asked for.
     by_beta : array (sites, 2)
         Derivative by the rating ratio.
+    loss : array (sites,)
+        Lost share of the import before the fault; 1 for a run that failed on its way, NaN where there is no
+        load that could be lost: no waveform, or a facility without an equilibrium before the fault.
     v_slope : array (sites, sites)
         Derivative of the lowest POI voltage, pu per MW.
     sequence : tuple of str
@@ -52,13 +55,10 @@ class Exact:
     value: Floats
     slope: Floats
     by_beta: Floats
+    loss: Floats
     v_slope: Floats
     sequence: tuple[str, ...]
     status: tuple[str, ...]
-
-    def linear(self, H: Floats) -> Floats:
-        """First-order prediction of the margins at another hosting vector, (sites, 2)."""
-        return np.asarray(self.value + self.slope @ (H - self.H))
 
 
 def exact_of(
@@ -87,9 +87,12 @@ def exact_of(
     for (mode, beta, period, fault), at in grouped.items():
         value, by_beta = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
         slope, v_slope = np.full((n, 2, n), np.nan), np.full((n, n), np.nan)
+        loss = np.full(n, np.nan)
         for k, row in at.items():
             if not row["ok"]:
+                loss[k] = 1.0 if row["failed_in"] == "facility" else np.nan
                 continue
+            loss[k] = row["loss_share"]
             value[k] = [row[column] for column in COLUMNS]
             gradients = row["gradients"]
             if gradients:
@@ -105,6 +108,7 @@ def exact_of(
                 value,
                 slope,
                 by_beta,
+                loss,
                 v_slope,
                 tuple(str(row.get("sequence", "")) for row in words),
                 tuple(str(row.get("status", "not run")) for row in words),
