@@ -7,8 +7,9 @@ A simulated margin with its total gradient gives the tangent
 where e is the allowance by which the replay has been seen to find less, and a little more than that, as a
 share of the size p of the margin. The row of a margin that belongs to a site holds while the site is open.
 Nothing is assumed about the shape of margins: a tangent that excludes a hosting vector whose margin is
-known to be met is wrong there, and is dropped; where the tangent belongs to a point that fails, a cut at the
-last passing point of the segment between the two takes its place (`Separation`).
+known to be met is wrong there, and is dropped. So is one at a point that fails, from beyond a jump of the
+margin. Where the tangent belongs to a point that fails, a cut at the last passing point of the segment
+between the two takes its place (`Separation`), unless the tangent there does.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ its curvature."""
 SETTLED = 2e-3
 """Distance within which a plan takes the capacities of a simulated point, MW: the hosting programme itself
 knows its optimum no better, as voltages agree with AC power flow to 1e-7 pu."""
+JUMP = 0.1
+"""Error of a tangent at a point of another event sequence, as a share of the margin's size, from which on the
+two do not belong to one piece: loss shares move by a few hundredths over all sizes, and by much more where a
+site is lost whole."""
 SAME_POINT = 1e-6
 """Hosting vectors that differ by less are one, MW."""
 
@@ -145,15 +150,20 @@ class Knowledge:
     # -- rows ----------------------------------------------------------------------------------------------
 
     def unexplained(self, one: Margins, number: int) -> bool:
-        """Whether the tangent at a failing point denies a point that meets the margin.
+        """Whether the tangent at a point is wrong at one that meets the margin: it denies that point, or,
+        where it fails itself, misses the margin by `JUMP` after another sequence of events.
 
         If not, the tangent may serve as a cut.
         """
-        key = (*one.place, number)
-        need = self.allowance.get(key, 0.0)
-        return any(
-            not one.linear(q.H)[number] >= need * q.size[number] for q in self.passing(key)
-        )
+        points = self.points[one.place]
+        k = next(i for i, other in enumerate(points) if other is one)
+        return bool(self._wrong(points, self.needs(one.place))[k, number])
+
+    def denies(self, one: Margins, number: int, H: Floats) -> bool:
+        """Whether the tangent at a point serves as a cut that excludes a hosting vector."""
+        need = self.needs(one.place)[number] + BACKOFF
+        excludes = one.linear(H)[number] < need * one.size_at(H)[number]
+        return bool(excludes) and not self.unexplained(one, number)
 
     def rows(self, box: Floats, centre: Floats | None = None, radius: float = np.inf) -> Iterator[Row]:
         """Rows of the hosting programme.
@@ -170,7 +180,7 @@ class Knowledge:
         """
         for place, points in self.points.items():
             needs = self.needs(place)
-            value, slope, H = (np.array([getattr(one, name) for one in points]) for name in TANGENT)
+            value, slope, H = _tangents(points)
             serving = self._serving(points, needs)
             if centre is not None:
                 serving &= self._local(points, needs, centre, radius)[:, None]
@@ -186,13 +196,24 @@ class Knowledge:
         yield from self._without_margin()
 
     def _serving(self, points: Sequence[Margins], needs: Floats) -> Flags:
-        """Which tangents may serve as rows, (points, margins): those that deny no point that meets the
-        margin."""
-        value, slope, H = (np.array([getattr(one, name) for one in points]) for name in TANGENT)
-        asked = needs * np.array([one.size for one in points])
+        """Which tangents may serve as rows, (points, margins): those that are whole, and not wrong."""
+        value, slope, _ = _tangents(points)
+        return np.asarray(np.isfinite(value) & np.isfinite(slope).all(axis=2) & ~self._wrong(points, needs))
+
+    def _wrong(self, points: Sequence[Margins], needs: Floats) -> Flags:
+        """Tangents that are wrong at a point that meets the margin, (points, margins)."""
+        value, slope, H = _tangents(points)
+        size = np.array([one.size for one in points])
         predicted = value[:, None] + np.einsum("pmj,pqj->pqm", slope, H[None] - H[:, None])
-        denied = ((value >= asked)[None] & (predicted < asked[None])).any(axis=1)
-        return np.asarray(np.isfinite(value) & np.isfinite(slope).all(axis=2) & ~denied)
+        met = value >= needs * size
+        words = np.array([one.words for one in points])
+        deciding = np.zeros((len(needs), len(self.sites)), dtype=bool)
+        for number in range(len(needs)):
+            deciding[number, list(self.requirement.involved(number))] = True
+        elsewhere = (words[:, None] != words[None]) @ deciding.T  # by another sequence of events
+        low = predicted < value[None] - JUMP * size[None]
+        denied = predicted < (needs * size)[None]
+        return np.asarray((met[None] & (denied | (~met[:, None] & elsewhere & low))).any(axis=1))
 
     def _local(self, points: Sequence[Margins], needs: Floats, centre: Floats, radius: float) -> Flags:
         """Which points count around a centre: the nearest, and those within the radius that fail."""
@@ -220,8 +241,13 @@ class Knowledge:
         )
 
 
-TANGENT = ("value", "slope", "H")
-"""Attributes of `Margins` that make a tangent."""
+def _tangents(points: Sequence[Margins]) -> tuple[Floats, Floats, Floats]:
+    """Values, slopes and hosting vectors of some points."""
+    return (
+        np.array([one.value for one in points]),
+        np.array([one.slope for one in points]),
+        np.array([one.H for one in points]),
+    )
 
 
 def same(a: Floats, b: Floats) -> bool:

@@ -302,6 +302,8 @@ class Search:
             yield from self._simulate(middle, [low.place])
             one = know.at(middle)[low.place]
             low, high = (low, one) if know.short(one, number) else (one, high)
+        if low.same_course(high, number) and know.denies(low, number, H):
+            return
         know.separations.append(separation(know, key, low, high))
 
     def _replay(self, H: Floats) -> Generator[Ask, None, tuple[Margins, ...] | None]:

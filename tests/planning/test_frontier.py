@@ -3,111 +3,17 @@ back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from dcvrt.errors import InputError
-from dcvrt.planning.exact import Exact, Run
-from dcvrt.planning.frontier import frontiers
-from dcvrt.planning.master import Cut, Master
-from dcvrt.planning.plan import Binding
+from dcvrt.planning.exact import Run
 from dcvrt.planning.requirement import EverySite
-from dcvrt.planning.search import Ask, Found, Options
-
-Margins = Callable[[np.ndarray, str, float], tuple[np.ndarray, np.ndarray, list[str]]]
-"""H, fault, beta -> values (sites, 2), slopes (sites, 2, sites), sequences."""
-PERIOD = "peak"
-
-
-class Programme:
-    """A hosting programme of one linear limit: sum_i w_i H_i <= budget."""
-
-    def __init__(self, n: int, budget: float, weights: Sequence[float] | None = None) -> None:
-        self.sites = tuple(range(1, n + 1))
-        self.weights = np.ones(n) if weights is None else np.asarray(weights)
-        self.budget = budget
-
-    def solve(self, rows=(), bounds=None) -> Answer:
-        low = np.array([bounds[bus][0] for bus in self.sites])
-        high = np.array([bounds[bus][1] for bus in self.sites])
-        master = Master(self.sites, low, high, tuple(rows))
-        master.cuts = [Cut(self.weights, self.budget, None)]
-        chosen = master.choose()
-        found = master.solve(chosen.open)
-        return Answer(
-            float(found.H.sum()),
-            dict(zip(self.sites, found.H.tolist(), strict=True)),
-            tuple(
-                Binding("row", row.label, float(-dual), "MW", row.lower, bus=row.site)
-                for row, dual in zip(master.rows, found.row_dual, strict=True)
-                if dual < -1e-7  # the lower limit binds
-            ),
-            {
-                bus: row.label
-                for row in master.rows
-                for bus in [row.site]
-                if found.H[self.sites.index(bus)] == 0
-            },
-        )
-
-
-@dataclass(frozen=True)
-class Answer:
-    total_mw: float
-    by_site: dict
-    binding: tuple
-    closed: dict
-
-
-class Oracle:
-    """Answers both engines from a closed form, and counts."""
-
-    def __init__(
-        self, programme: Programme, margins: Margins, faults: Sequence[str], less: float = 0.0
-    ) -> None:
-        self.sites, self.margins, self.faults, self.less = programme.sites, margins, faults, less
-        self.places = [(PERIOD, fault) for fault in faults]
-        self.simulated: list[tuple] = []
-        self.replayed: list[tuple] = []
-
-    def simulate(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[dict[Run, list[Exact]]]:
-        answers = []
-        for ask, runs in questions:
-            H = np.array(ask.H)
-            self.simulated += [(ask.H, place) for place in ask.places]
-            answers.append({run: [self._exact(H, place, run) for place in ask.places] for run in runs})
-        return answers
-
-    def _exact(self, H: np.ndarray, place: tuple[str, str], run: Run) -> Exact:
-        value, slope, sequence = self.margins(H, place[1], run[1])
-        n = len(H)
-        return Exact(
-            H,
-            place,
-            value,
-            slope,
-            np.ones((n, 2)),
-            0.25 - value[:, 1],
-            -0.01 * np.eye(n),
-            tuple(sequence),
-            ("completed",) * n,
-        )
-
-    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[dict[Run, list[Exact]]]:
-        answers = []
-        for ask, runs in questions:
-            self.replayed.append(ask.H)
-            here = {run: [self._exact(np.array(ask.H), place, run) for place in self.places] for run in runs}
-            answers.append({run: [self._weaker(one) for one in exact] for run, exact in here.items()})
-        return answers
-
-    def _weaker(self, one: Exact) -> Exact:
-        """As the replay finds it: without gradients, and `less` of every margin."""
-        nothing = np.full_like(one.slope, np.nan)
-        return replace(one, value=one.value - self.less, loss=one.loss + self.less, slope=nothing)
+from dcvrt.planning.search import Found
+from tests.planning import closed_form
+from tests.planning.closed_form import PERIOD, Margins, Oracle, Programme, passes
 
 
 def search(
@@ -118,23 +24,9 @@ def search(
     samples: np.ndarray | None = None,
     **options: float,
 ) -> list[Found]:
-    corner = np.asarray(box, dtype=float)
-    points = np.vstack([0.5 * corner, 0.01 * corner]) if samples is None else samples
-    return frontiers(
-        programme,
-        [(run, EverySite(programme.sites)) for run in runs],
-        corner,
-        points,
-        oracle.places,
-        oracle.simulate,
-        oracle.replay,
-        Options(**options),
-    )
-
-
-def passes(found: Found) -> bool:
-    """Whether a plan of something has a replay in which everything that counts is met."""
-    return bool(found.certificate) and not any(one.missed() for one in found.certificate)
+    """Plans whose every site meets its own margins."""
+    wanted = [(run, EverySite(programme.sites)) for run in runs]
+    return closed_form.search(programme, oracle, box, wanted, samples, **options)
 
 
 def affine(a: np.ndarray, b: np.ndarray) -> Margins:
