@@ -35,6 +35,7 @@ class BatchResult:
     margins : margins of each case, None where the run failed or no criteria were given.
     runs : trajectories when `keep` was asked for, else None.
     functionals : those asked for, by name; none where the run failed.
+    started : whether the case had an equilibrium to start from.
     """
 
     waveforms: tuple[str, ...]
@@ -43,6 +44,7 @@ class BatchResult:
     margins: tuple[Margins | None, ...]
     runs: tuple[Trajectory | None, ...]
     functionals: tuple[Mapping[str, Outcome], ...]
+    started: tuple[bool, ...]
 
     def __len__(self) -> int:
         return len(self.status)
@@ -100,6 +102,7 @@ def run_batch(
         tuple(answer.margins for answer in answers),
         tuple(runs),
         tuple(answer.functionals for answer in answers),
+        tuple(answer.started for answer in answers),
     )
 
 
@@ -111,6 +114,7 @@ class _Answer:
     margins: Margins | None = None
     functionals: Mapping[str, Outcome] = field(default_factory=dict)
     run: Trajectory | None = None
+    started: bool = True
 
     @classmethod
     def of(
@@ -130,7 +134,7 @@ def _one_run(
     try:
         run = simulator.attempt(waveform, None, **values)
     except SimulationError as error:
-        return _Answer(str(error))
+        return _Answer(str(error), started=False)
     kept = run if keep else None
     if not run.completed:
         return _Answer(run.status, run=kept)
@@ -146,7 +150,7 @@ def _on_kernel(simulator: Simulator, waveforms: Sequence[Waveform], P: Array, as
     kernel = simulator._kernel(tangents, watched(asked.everything))
     tables = [simulator._table(kernel, w) for w in waveforms]
     X, Z, unstarted = simulator._begin_all(kernel, [channels for channels, _ in tables], P)
-    answers = {k: _Answer(message) for k, message in unstarted.items()}
+    answers = {k: _Answer(message, started=False) for k, message in unstarted.items()}
     started = [k for k in range(len(P)) if k not in unstarted]
     if started:
         wanted = Table.of(asked.everything, values_only=asked.values_only) if asked.everything else None

@@ -216,10 +216,13 @@ class Knowledge:
         return np.asarray((met[None] & (denied | (~met[:, None] & elsewhere & low))).any(axis=1))
 
     def _local(self, points: Sequence[Margins], needs: Floats, centre: Floats, radius: float) -> Flags:
-        """Which points count around a centre: the nearest, and those within the radius that fail."""
-        away = np.array([abs(one.H - centre).max() for one in points])
+        """Which points count around a centre: the nearest, and those within the radius that fail.
+
+        A site may always be closed, however far that is, so that closed sites tell no distance.
+        """
+        away = np.array([abs(np.where(one.H > 0, one.H - centre, 0.0)).max() for one in points])
         failing = np.array([bool((~(one.value >= needs * one.size)).any()) for one in points])
-        return (away <= radius) & failing | (np.arange(len(points)) == away.argmin())
+        return (away <= radius + SAME_POINT) & failing | (np.arange(len(points)) == away.argmin())
 
     def _without_margin(self) -> Iterator[Row]:
         """A site that is unknown wherever it was simulated does not pass."""

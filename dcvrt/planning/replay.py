@@ -234,8 +234,10 @@ def _facility_rows(
         criteria=_criteria(_frozen(request["criteria"])),
     )
     rows = []
-    for (fault, site, beta), status, found in zip(cases, result.status, result.margins, strict=True):
-        row = _row(period, fault, site, mode, beta, hosting[site], status, "facility")
+    outcomes = zip(cases, result.status, result.started, result.margins, strict=True)
+    for (fault, site, beta), status, started, found in outcomes:
+        failed_in = "facility" if started else "start"
+        row = _row(period, fault, site, mode, beta, hosting[site], status, failed_in)
         v_min, dv_min = lowest_voltage(waveforms[fault][site], wrt[1:])
         row |= {"p_mw": d * hosting[site], "v_poi_min_pu": v_min}
         if found is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dcvrt.studies.store import Store, records
+from dcvrt.studies.store import RUN_FAILED, Store, records
 
 PAPER, FRONTIER = "paper", "frontier"
 
@@ -79,7 +79,7 @@ def _simulations(store: Store) -> dict[str, dict[str, int]]:
             "grid_failed": int((faults.failed_in == "grid").sum()),
             "facility": len(ran),
             "facility_with_gradients": len(ran) if kind == "frontier" else 0,
-            "facility_failed": int((ran.failed_in == "facility").sum()),
+            "facility_failed": int(ran.failed_in.isin(RUN_FAILED).sum()),
         }
     return spent
 

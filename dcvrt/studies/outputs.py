@@ -17,7 +17,7 @@ from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.comparison import comparison
-from dcvrt.studies.store import Store, records
+from dcvrt.studies.store import RUN_FAILED, Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -167,11 +167,11 @@ def simulations(store: Store) -> dict[str, int]:
     """
     margins, tasks = store.margins(), store.tasks()
     faults = margins[margins.failed_in != "task"].drop_duplicates(["hosting", "period", "fault"])
-    ran = margins[margins.failed_in.isin(["", "facility"])]
+    ran = margins[margins.failed_in.isin(["", *RUN_FAILED])]
     return {
         "grid": len(faults),
         "facility": len(ran),
-        "failed": int((faults.failed_in == "grid").sum() + (ran.failed_in == "facility").sum()),
+        "failed": int((faults.failed_in == "grid").sum() + ran.failed_in.isin(RUN_FAILED).sum()),
         "quarantined": int(tasks.status.isin(LOST).sum()),
     }
 

@@ -77,7 +77,7 @@ def test_constant_shares_are_a_linear_programme(seed: int) -> None:
 def test_shares_that_rise_with_the_load_reach_the_optimum_of_an_independent_solver(seed: int) -> None:
     from scipy.optimize import LinearConstraint, NonlinearConstraint, minimize
 
-    cap, a, b = random_shares(8, 3, seed, 0.2)
+    cap, a, b = random_shares(8, 3, seed, 0.1)
     limit, programme = 40.0, Programme(8, 0.9 * float(cap.sum()))
     best = minimize(
         lambda H: -H.sum(),

@@ -174,7 +174,7 @@ def _failed(row: dict[str, Any]) -> dict[str, Any]:
     mode, H = row["mode"], row["h_mw"]
     where = (row["period"], row["fault"], row["site"], mode, row["beta"])
     status = f"{mode}: no equilibrium at the first value of the waveform. Largest residuals:\n  dc.w = 1"
-    return replay._row(*where, H, status, "facility")
+    return replay._row(*where, H, status, "start")
 
 
 def _weakened(row: dict[str, Any], file: StudyFile, scale: float) -> dict[str, Any]:

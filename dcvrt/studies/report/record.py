@@ -81,7 +81,7 @@ def simulations(findings: Findings) -> Safe:
 
 def failed_runs(findings: Findings) -> pd.DataFrame:
     """Rows of margins whose simulation failed, with the first line of what it said as `reason`."""
-    failed = findings.margins[findings.margins.failed_in.isin(["grid", "facility"])]
+    failed = findings.margins[findings.margins.failed_in.isin(["grid", *RUN_FAILED])]
     return failed.assign(reason=[first_sentence(status) for status in failed.status])
 
 
