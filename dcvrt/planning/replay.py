@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dcvrt.errors import InfeasibleError, SimulationError
+from dcvrt.planning.exact import Exact
+from dcvrt.planning.requirement import SystemLimit, lost_whole
 
 if TYPE_CHECKING:
     from dcvrt.criteria import Criteria
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 SIGNALS = ("v_it", "p_g", "q_g", "i_g", "p_b", "soc", "w_dc", "p_out", "mode")
 """Facility outputs that are kept of the worst cases."""
 SIGNAL_UNITS = {"v_it": "pu", "i_g": "pu", "soc": "1", "w_dc": "1", "mode": "1"}
+ALL = 1.0 - 1e-6
+"""Lost share from which on nothing is left."""
 SAVE_AT = 2e-3
 """Distance of the samples that are kept, s."""
 
@@ -450,4 +454,43 @@ def verdict(rows: Sequence[Mapping[str, Any]], by_site: Mapping[int, float], exp
             "loss": {key: loss[key] for key in where},
             "aggregate": {"period": at[0], "fault": at[1]},
         },
+    }
+
+
+def limit_verdict(replayed: Sequence[Exact], limit: SystemLimit, expected: int) -> dict[str, Any]:
+    """Whether the load that drops off at once stays within a limit, under every fault in every period.
+
+    Parameters
+    ----------
+    replayed : what the replay found at the hosting vector of a plan, at its mode and rating.
+    limit : what has to be met.
+    expected : number of faults times periods.
+
+    Returns
+    -------
+    dict
+        `passed`; `aggregate_loss_mw`: the largest loss of all sites together, None when none is known;
+        `losses`: one by one, period, fault, loss_mw, limit_mw and `whole`, the open sites that lose all of
+        their load; `n_failed`: faults and periods in which an open site has no result, or that are missing.
+        With any of these the plan has not passed.
+    """
+    losses: list[dict[str, Any]] = []
+    passed = True
+    for one in replayed:
+        margins = limit.margins(one)
+        passed &= not margins.missed()
+        left = float(margins.value[0])
+        if not math.isfinite(left):
+            continue
+        allowed = limit.mw + limit.share * float(margins.size[0])
+        whole = (one.H > 0) & (lost_whole(one) | (one.loss >= ALL))
+        buses = [limit.sites[k] for k in np.flatnonzero(whole)]
+        place = dict(zip(("period", "fault"), one.place, strict=True))
+        losses.append(place | {"loss_mw": allowed - left, "limit_mw": allowed, "whole": buses})
+    n_failed = expected - len(losses)
+    return {
+        "passed": passed and n_failed == 0,
+        "aggregate_loss_mw": max((entry["loss_mw"] for entry in losses), default=None),
+        "losses": losses,
+        "n_failed": n_failed,
     }

@@ -338,7 +338,9 @@ class Search:
             for bus, mw in best.plan.by_site.items()
             if not mw > 0
         }
-        prices = {item.label: item.price for item in best.plan.binding}
+        prices: dict[str, float] = {}
+        for item in best.plan.binding:  # tangents of several points may share a price
+            prices[item.label] = prices.get(item.label, 0.0) + item.price
         counts = np.flatnonzero(know.requirement.counts(best.H)).tolist()
         binding = []
         for place, one in know.at(best.H).items():

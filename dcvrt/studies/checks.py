@@ -23,6 +23,7 @@ from dcvrt.studies.config import (
     PeriodEntry,
     SamplingSection,
     StudyFile,
+    SystemLimitSection,
     WhatIfEntry,
     read,
 )
@@ -123,6 +124,12 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                 "frontier.search = true: needs gradients, which grid.engine = 'andes' does not give. "
                 "Way out: grid.engine = 'native', or search = false."
             )
+        limits: SystemLimitSection | None = sections.get("system_limit")
+        if limits is not None and (limits.loss_mw or limits.loss_share) and not getattr(frontier, "search", True):
+            problems.append(
+                "system_limit: its plans are searched like the frontier, and frontier.search = false. Way out: "
+                "search = true, or no limits."
+            )
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
             problems += [
@@ -157,6 +164,27 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
             problems.append(f"facility.beta = {facility.beta}: must rise from one value to the next.")
         problems += [
             f"facility.modes: {mode!r} is listed more than once." for mode in _repeated(facility.modes)
+        ]
+    return problems + wrong_limits(sections)
+
+
+def wrong_limits(sections: Mapping[str, Any]) -> list[str]:
+    """System limits that are given twice or out of order, or at ratings that the study does not have."""
+    limits: SystemLimitSection | None = sections.get("system_limit")
+    facility: FacilitySection | None = sections.get("facility")
+    if limits is None:
+        return []
+    listed = {"loss_mw": limits.loss_mw, "loss_share": limits.loss_share, "beta": limits.beta or []}
+    problems = [
+        f"system_limit.{name} = {values}: must rise from one value to the next."
+        for name, values in listed.items()
+        if any(b <= a for a, b in zip(values, values[1:], strict=False))
+    ]
+    if facility is not None:
+        problems += [
+            f"system_limit.beta[{k}] = {beta:g}: is not among facility.beta.{did_you_mean(beta, facility.beta)}"
+            for k, beta in enumerate(limits.beta or [], start=1)
+            if beta not in facility.beta
         ]
     return problems
 

@@ -8,6 +8,15 @@ from typing import Any
 from dcvrt.studies.store import RUN_FAILED, Store, records
 
 PAPER, FRONTIER = "paper", "frontier"
+KINDS = {
+    "sample": "paper",
+    "search": "frontier",
+    "candidate": "replay",
+    "plan": "replay",
+    "system search": "system_search",
+    "system candidate": "system_replay",
+}
+"""What hosting vectors are simulated for, by their roles."""
 
 
 def comparison(store: Store) -> dict[str, Any]:
@@ -21,8 +30,9 @@ def comparison(store: Store) -> dict[str, Any]:
         the paper's method, None where the plan of either failed; of the frontier: margins (what binds),
         by_sequence, candidates, refused, gap, settled.
         `simulations`: by role of the hosting vector (`paper`: the samples of the fits; `frontier`: samples
-        and candidates of the search; `replay`: both methods' replays), fault simulations and facility runs,
-        with gradients or without, and how many failed.
+        and candidates of the search; `replay`: both methods' replays; `system_search`, `system_replay`: what
+        system limits took beyond that), fault simulations and facility runs, with gradients or without, and
+        how many failed.
         `ratio`: fault simulations of the search over those of the paper's sampling.
         `hidden`: sentences on capacity that passed the replay and that the paper's fits did not allow.
     """
@@ -66,19 +76,19 @@ def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any
 def _simulations(store: Store) -> dict[str, dict[str, int]]:
     margins = store.margins()
     role = dict(zip(store.hostings().name, store.hostings().role, strict=True))
-    kinds = {"sample": "paper", "search": "frontier", "candidate": "replay", "plan": "replay"}
-    margins = margins.assign(kind=[kinds[role[name]] for name in margins.hosting])
+    margins = margins.assign(kind=[KINDS[role[name]] for name in margins.hosting])
     spent = {}
-    for kind in ("paper", "frontier", "replay"):
+    for kind in dict.fromkeys(KINDS.values()):
+        gradients = kind in ("frontier", "system_search")
         here = margins[(margins.kind == kind) & (margins.failed_in != "task")]
         faults = here.drop_duplicates(["hosting", "period", "fault"])
         ran = here[here.failed_in != "grid"]
         spent[kind] = {
             "grid": len(faults),
-            "grid_with_gradients": len(faults) if kind == "frontier" else 0,
+            "grid_with_gradients": len(faults) if gradients else 0,
             "grid_failed": int((faults.failed_in == "grid").sum()),
             "facility": len(ran),
-            "facility_with_gradients": len(ran) if kind == "frontier" else 0,
+            "facility_with_gradients": len(ran) if gradients else 0,
             "facility_failed": int(ran.failed_in.isin(RUN_FAILED).sum()),
         }
     return spent

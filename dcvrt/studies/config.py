@@ -20,6 +20,7 @@ from dcvrt.errors import InputError, did_you_mean, raise_all
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, lt=1)]
+ShareOrAll = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 INSTEAD = "in place of that of [criteria]"
 
@@ -173,6 +174,20 @@ class FrontierSection(Section):
     )
 
 
+class SystemLimitSection(Section):
+    """`[system_limit]`: plans whose sites may fail singly, as long as the load that is lost at once stays small."""
+
+    loss_mw: list[NotNegative] = Field(
+        default=[], description="limits on the load that all sites together lose in one fault, MW, rising"
+    )
+    loss_share: list[ShareOrAll] = Field(
+        default=[], description="limits as a share of the hosted load before the fault, rising"
+    )
+    beta: list[Positive] | None = Field(
+        default=None, min_length=1, description="ratings that are tried; default: all of facility.beta"
+    )
+
+
 class ReplaySection(Section):
     """`[replay]`: the simulation that has the last word on every plan."""
 
@@ -229,6 +244,7 @@ class StudyFile(BaseModel):
     sampling: SamplingSection = SamplingSection()
     surrogate: SurrogateSection = SurrogateSection()
     frontier: FrontierSection = FrontierSection()
+    system_limit: SystemLimitSection = SystemLimitSection()
     replay: ReplaySection = ReplaySection()
     run: RunSection = RunSection()
     fault: list[FaultEntry] = Field(min_length=1, description="the faults that every site must ride through")
@@ -236,12 +252,14 @@ class StudyFile(BaseModel):
     what_if: list[WhatIfEntry] = Field(default=[], description="assumptions to vary on the largest plan")
 
     def canonical(self) -> dict[str, Any]:
-        """Everything that decides a plan, as plain data: `[run]`, the name and `[[what_if]]` do not.
+        """Everything that decides a plan of the study, as plain data: `[run]`, the name, `[system_limit]` and
+        `[[what_if]]` do not.
 
-        What-ifs are asked of finished plans, so that a folder may be asked again with others.
+        System limits and what-ifs are asked once the plans are there, so that a folder may be asked again with
+        others.
         """
         data = self.model_dump(mode="json")
-        del data["run"], data["what_if"], data["study"]["name"]
+        del data["run"], data["what_if"], data["system_limit"], data["study"]["name"]
         return data
 
     def quick(self) -> StudyFile:
@@ -252,6 +270,8 @@ class StudyFile(BaseModel):
         """
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})
+        limits = self.system_limit
+        near = [min(few, key=lambda b: abs(b - wanted)) for wanted in limits.beta or []]
         some = sorted({0, len(self.what_if) // 2, len(self.what_if) - 1}) if self.what_if else []
         ends = self.period if len(self.period) < 3 else [self.period[0], self.period[-1]]
         return self.model_copy(
@@ -259,6 +279,7 @@ class StudyFile(BaseModel):
                 "sampling": self.sampling.model_copy(update={"n": min(self.sampling.n, 10)}),
                 "facility": self.facility.model_copy(update={"beta": few}),
                 "period": ends,
+                "system_limit": limits.model_copy(update={"beta": sorted(set(near)) or None}),
                 "what_if": [self.what_if[k] for k in some],
             }
         )

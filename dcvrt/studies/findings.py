@@ -115,6 +115,14 @@ class Findings:
             return comparison(store)
 
     @cached_property
+    def system_limits(self) -> dict[str, Any]:
+        """Plans under system limits, beside those whose every site rides through."""
+        from dcvrt.studies.system_limit import system_limits
+
+        with self._store() as store:
+            return system_limits(store)
+
+    @cached_property
     def what_ifs(self) -> pd.DataFrame:
         """Least ratings of the largest plans under varied assumptions."""
         with self._store() as store:
@@ -305,11 +313,9 @@ class Findings:
         Among the runs whose facility waveforms were kept: for every plan, those where its voltage margin and
         where its loss margin is least.
         """
-        replayed = self.margins[
-            (self.margins.ok == 1)
-            & (self.margins.h_mw > 0)
-            & self.margins.hosting.isin(self.hostings.name[self.hostings.role == "plan"])
-        ]
+        replayed = self.margins[(self.margins.ok == 1) & (self.margins.h_mw > 0)]
+        # A vector is replayed for several modes and ratings, and is the plan of some of them.
+        replayed = replayed.merge(self.plans[["hosting", "mode", "beta"]].drop_duplicates())
         if mode is not None:
             replayed = replayed[replayed["mode"] == mode]
         kept = self._kept_runs

@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from dcvrt.planning import replay
 from dcvrt.planning.exact import Exact, Run, exact_of
-from dcvrt.planning.frontier import Ask, Found, Options, frontiers
+from dcvrt.planning.frontier import Known, frontiers
 from dcvrt.planning.mechanism import mechanism
+from dcvrt.planning.requirement import EverySite, Requirement
 from dcvrt.planning.sampling import sample_hosting
-from dcvrt.studies import phases
+from dcvrt.planning.search import Ask, Found, Options
+from dcvrt.studies import phases, system_limit
 from dcvrt.studies.campaign import Campaign
 from dcvrt.studies.phases import CANDIDATES, FRONTIER, Job, Setting
 from dcvrt.studies.store import Store, records
@@ -26,39 +27,54 @@ METHOD = "frontier"
 
 
 def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[str]:
-    """Search the frontier of every mode and rating and write its plans; messages of what was set aside.
+    """Search the frontier of every mode and rating, then under every system limit, and write the plans;
+    messages of what was set aside.
 
     The search is made again when anything that it was made from has changed since; what it has simulated
-    before is read from the store.
+    before is read from the store. System limits come last: they change nothing of the other plans.
     """
     if not setting.file.frontier.search:
         return []
     store = campaign.store
-    if store.provenance().get("frontier_from") == _state(store):
+    if store.provenance().get("frontier_from") == _state(store, setting):
         return []
-    asked = _Campaign(campaign, setting)
+    asked, known = _Campaign(campaign, setting), Known()
     f = setting.file.frontier
-    found = frontiers(
-        setting.problem,
-        setting.runs,
-        setting.problem.upper,
-        coarse_samples(setting),
-        [(period, label) for period in setting.periods for label in asked.labels],
-        asked.simulate,
-        asked.replay,
-        Options(gain=f.gain, trust=f.trust, candidates=f.candidates),
-        lambda ended, total: progress("searches", ended, total, 0),
-    )
+
+    def search(wanted: Sequence[tuple[Run, Requirement]], title: str) -> list[Found]:
+        return frontiers(
+            setting.problem,
+            wanted,
+            setting.problem.upper,
+            coarse_samples(setting),
+            [(period, label) for period in setting.periods for label in asked.labels],
+            asked.simulate,
+            asked.replay,
+            Options(gain=f.gain, trust=f.trust, candidates=f.candidates),
+            lambda ended, total: progress(title, ended, total, 0),
+            known,
+        )
+
+    found = search([(run, EverySite(setting.sites)) for run in setting.runs], "searches")
+    limits = system_limit.wanted(setting)
+    asked.roles = system_limit.ROLES
+    within = search(limits, "system limits") if limits else []
     rows = [_plan_row(setting, one) for one in found]
+    limited = [
+        system_limit.plan_row(setting, limit, one)
+        for (_, limit), one in zip(limits, within, strict=True)
+    ]
     checked: dict[str, dict[str, Any]] = {}
-    for row, one in zip(rows, found, strict=True):
+    for row, one in zip([*rows, *limited], [*found, *within], strict=True):
         if row["hosting"] not in checked:
             checked[row["hosting"]] = phases.power_flow(setting.problem, one.plan)
         row |= checked[row["hosting"]]
     with store.transaction():
         store.put("hostings", [phases.plan_hosting(row) for row in rows])
         store.put("plans", rows)
-        store.note(frontier_from=_state(store))
+        store.clear("system_plans")
+        store.put("system_plans", limited)
+        store.note(frontier_from=_state(store, setting))
     return asked.lost
 
 
@@ -109,41 +125,40 @@ def _mechanism(store: Store, setting: Setting, plan: Mapping[str, Any], item: Ma
     return mechanism(run, modes, target, here.diagnostics.iloc[0][f"{target}_time"], window)
 
 
-def _state(store: Store) -> str:
-    """Digest of what a frontier is made from: its tasks with their states, and of its plans."""
+def _state(store: Store, setting: Setting) -> str:
+    """Digest of what the frontiers are made from: tasks with their states, and limits; and of their plans."""
     tasks = [(t["hash"], t["status"]) for t in records(store.tasks()) if t["phase"] in (FRONTIER, CANDIDATES)]
     found = [p["hosting"] for p in records(store.plans()) if p["method"] == METHOD]
-    return hashlib.sha256(json.dumps([sorted(tasks), found]).encode()).hexdigest()
+    limits = setting.file.system_limit.model_dump()
+    limited = [p["hosting"] for p in records(store.system_plans())]
+    return hashlib.sha256(json.dumps([sorted(tasks), found, limits, limited]).encode()).hexdigest()
 
 
 def _plan_row(setting: Setting, found: Found) -> dict[str, Any]:
     row = phases.plan_row(setting, METHOD, found.mode, found.beta, found.plan, found.closed, None)
-    return row | {
-        "search": {
-            "candidates": found.candidates,
-            "refused": found.failed,
-            "gap": found.gap,
-            "settled": found.settled,
-            "by_sequence": list(found.by_sequence),
-            "margins": [asdict(margin) for margin in found.binding],
-        }
-    }
+    return row | {"search": system_limit.told(found)}
 
 
 class _Campaign:
-    """Answers the questions of the searches by tasks of a campaign."""
+    """Answers the questions of the searches by tasks of a campaign.
+
+    Attributes
+    ----------
+    roles : of the hosting vectors that are searched, and of those that are replayed.
+    """
 
     def __init__(self, campaign: Campaign, setting: Setting) -> None:
         self.campaign, self.setting = campaign, setting
         self.labels = [replay.fault_label(fault.model_dump()) for fault in setting.file.fault]
         self.lost: list[str] = []
+        self.roles = ("search", "candidate")
 
     def simulate(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[Mapping[Run, Sequence[Exact]]]:
         setting, store = self.setting, self.campaign.store
         engine = setting.file.grid.engine
         jobs = []
         for ask, runs in questions:
-            self._enter(ask, "f", "search")
+            self._enter(ask, "f", self.roles[0])
             for period in setting.periods:
                 faults = [fault for p, fault in ask.places or () if p == period]
                 if faults:
@@ -160,15 +175,19 @@ class _Campaign:
             answers.append(exact_of(here, setting.sites, ask.H))
         return answers
 
-    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[list[dict[str, Any]]]:
+    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[Mapping[Run, Sequence[Exact]]]:
         store = self.campaign.store
         for ask, _ in questions:
-            self._enter(ask, "p", "candidate")
+            self._enter(ask, "p", self.roles[1])
         plans = [(self._name(ask, "p"), ask.H, list(runs)) for ask, runs in questions]
         self.lost += phases.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
         return [
-            [row for row in records(store.margins(hosting=name)) if (row["mode"], row["beta"]) in runs]
-            for name, _, runs in plans
+            exact_of(
+                [r for r in records(store.margins(hosting=name)) if (r["mode"], r["beta"]) in runs],
+                self.setting.sites,
+                H,
+            )
+            for name, H, runs in plans
         ]
 
     def _by_site(self, ask: Ask) -> dict[str, float]:

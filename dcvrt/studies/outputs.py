@@ -18,11 +18,17 @@ from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.comparison import comparison
 from dcvrt.studies.store import RUN_FAILED, Store, records
+from dcvrt.studies.system_limit import system_limits
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FRONTIER = "frontier.json"
+SYSTEM_KEYS = (
+    "mode", "beta", "limit", "limit_mw", "limit_share", "total_mw", "by_site", "passed", "ac_passed",
+    "aggregate_loss_mw", "lost_whole", "price_mw_per_mw",
+)  # fmt: skip
+"""What the summary says of a plan under a system limit; `frontier.json` has the rest."""
 STORE, SUMMARY, TABLE, VALIDATION, STUDY = (
     "study.sqlite",
     "summary.json",
@@ -71,7 +77,11 @@ def write_results(folder: Path, store: Store) -> list[Path]:
         write_atomically(folder / TABLE, plan_table(store).to_csv(index=False)),
         write_atomically(folder / VALIDATION, validation_table(store).to_csv(index=False)),
         write_atomically(
-            folder / FRONTIER, json.dumps(_clean(comparison(store)), indent=2, allow_nan=False) + "\n"
+            folder / FRONTIER,
+            json.dumps(
+                _clean(comparison(store) | {"system_limit": system_limits(store)}), indent=2, allow_nan=False
+            )
+            + "\n",
         ),
         write_atomically(folder / SUMMARY, json.dumps(summary(store), indent=2, allow_nan=False) + "\n"),
     ]
@@ -86,6 +96,9 @@ def summary(store: Store) -> dict[str, Any]:
         {
             "no_vrt": {"total_mw": none["total_mw"], "by_site": none["by_site"]},
             "rows": [_plan(plan, known["engine"]) for plan in plans if plan["method"] != "none"],
+            "system_limit": [
+                {name: row[name] for name in SYSTEM_KEYS} for row in system_limits(store)["rows"]
+            ],
             "surrogate": surrogate_scores(store),
             "simulations": simulations(store),
             "wall_s": known.get("wall_s", 0.0),
@@ -177,8 +190,8 @@ def simulations(store: Store) -> dict[str, int]:
 
 
 def plan_table(store: Store) -> pd.DataFrame:
-    """One row per plan, the one without ride-through first: capacities, verdicts, what is worst and what
-    closes."""
+    """One row per plan, the one without ride-through first, those under system limits last: capacities,
+    verdicts, what is worst and what closes."""
     import pandas as pd
 
     rows = []
@@ -205,6 +218,23 @@ def plan_table(store: Store) -> pd.DataFrame:
                 "ac_v_error_pu": plan["ac_v_error_pu"],
                 "closed_sites": " ".join(plan["closed"]),
                 "carried_from_beta": plan["carried_from"],
+            }
+        )
+    for plan in records(store.system_plans()):
+        rows.append(
+            {
+                "method": f"system limit {plan['limit_name']}",
+                "mode": plan["mode"],
+                "beta": plan["beta"],
+                "total_mw": plan["total_mw"],
+                **{f"bus_{bus}_mw": mw for bus, mw in plan["by_site"].items()},
+                "replay": verdict_word(plan),
+                "aggregate_loss_mw": plan["aggregate_loss_mw"],
+                "failed_runs": plan["n_failed"],
+                "ac": "passed" if plan["ac_passed"] else "failed",
+                "ac_v_min_pu": plan["ac_v_min_pu"],
+                "ac_v_error_pu": plan["ac_v_error_pu"],
+                "closed_sites": " ".join(plan["closed"]),
             }
         )
     return pd.DataFrame(rows)

@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from dcvrt.errors import DcvrtError, InputError
 from dcvrt.planning import replay
+from dcvrt.planning.exact import exact_of
 from dcvrt.planning.hosting import HostingProblem
 from dcvrt.planning.kept import one_sided, side_by_side
 from dcvrt.planning.plan import Plan
+from dcvrt.planning.requirement import SystemLimit
 from dcvrt.planning.sampling import Samples, sample_hosting
 from dcvrt.planning.surrogate import TARGETS, MarginData, Surrogate, fit_surrogates
 from dcvrt.planning.sweep import sweep
@@ -170,12 +172,15 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     """Simulate every plan that hosts anything, each hosting vector once; then write the verdicts."""
     store = campaign.store
     plans = [p for p in records(store.plans()) if p["method"] != NO_VRT]
+    limited = records(store.system_plans())
     wanted: dict[str, tuple[list[float], set[tuple[str, float]]]] = {}
-    for plan in plans:
+    for plan in [*plans, *limited]:
         if plan["total_mw"] > 0:
-            H = [plan["by_site"][str(bus)] for bus in setting.sites]
-            wanted.setdefault(plan["hosting"], (H, set()))[1].add((plan["mode"], plan["beta"]))
-    made = {tuple(key) for key in store.margins("plan")[["hosting", "mode", "beta"]].itertuples(index=False)}
+            wanted.setdefault(plan["hosting"], (_hosted(plan, setting), set()))[1].add(
+                (plan["mode"], plan["beta"])
+            )
+    keys = ["hosting", "mode", "beta"]
+    made = {tuple(key) for key in store.margins(hosting=list(wanted))[keys].itertuples(index=False)}
     lost = replay_plans(
         campaign,
         setting,
@@ -186,23 +191,28 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             if (missing := sorted(run for run in runs if (name, *run) not in made))
         ],
     )
-    margins = store.margins("plan")
+    runs_of = {key: records(rows) for key, rows in store.margins(hosting=list(wanted)).groupby(keys)}
+    places = len(setting.periods) * len(setting.file.fault)
     with store.transaction():
         for plan in plans:
+            rows = runs_of.get((plan["hosting"], plan["mode"], plan["beta"]), [])
             by_site = {int(bus): mw for bus, mw in plan["by_site"].items()}
-            here = (
-                (margins.hosting == plan["hosting"])
-                & (margins["mode"] == plan["mode"])
-                & (margins.beta == plan["beta"])
-            )
-            rows = records(margins[here])
-            is_open = sum(mw > 0 for mw in by_site.values())
-            expected = is_open * len(setting.periods) * len(setting.file.fault)
-            found = replay.verdict(rows, by_site, expected)
+            found = replay.verdict(rows, by_site, sum(mw > 0 for mw in by_site.values()) * places)
             of_power_flow = {key: value for key, value in plan["worst"].items() if key == REACTIVE}
             found["worst"] = found["worst"] | of_power_flow
             store.put("plans", [plan | found | {"replayed": 1}])
+        for plan in limited:
+            rows = runs_of.get((plan["hosting"], plan["mode"], plan["beta"]), [])
+            limit = SystemLimit(setting.sites, setting.d, plan["limit_mw"], plan["limit_share"])
+            exact = [one for some in exact_of(rows, setting.sites, _hosted(plan, setting)).values() for one in some]
+            found = replay.limit_verdict(exact, limit, places if plan["total_mw"] > 0 else 0)
+            store.put("system_plans", [plan | found | {"replayed": 1}])
     return lost
+
+
+def _hosted(plan: Mapping[str, Any], setting: Setting) -> list[float]:
+    """Capacities of a plan in the order of the sites."""
+    return [plan["by_site"][str(bus)] for bus in setting.sites]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ order in which the work was done):
 `provenance`   key, value (JSON): study text and hash, versions, platform, compiler, seeds, network, sources.
 `tasks`        hash, phase, text, status (open, done, failed, timeout, quarantined), attempts, message,
 seconds. `hostings`     name, role ('sample'; 'search': simulated on the way to the frontier; 'candidate':
-replayed there and no plan; 'plan'), subset ('fit', 'validation' or ''), total_mw, by_site
+replayed there and no plan; 'system search', 'system candidate': the same for plans under a system limit;
+'plan'), subset ('fit', 'validation' or ''), total_mw, by_site
 {bus: MW}. `margins`      one checked facility run: hosting, period, fault, site, mode, beta; h_mw, p_mw
 (import before the
                fault); v_margin_pu, loss_margin_share, loss_margin_mw, loss_share, loss_mw; v_poi_min_pu
@@ -17,7 +18,8 @@ replayed there and no plan; 'plan'), subset ('fit', 'validation' or ''), total_m
                (modes passed through), battery (1 when the supervisor visited BATTERY), diagnostics and
                gradients (JSON; {voltage, loss, v_poi: {beta, H_<bus>: derivative}} where asked for).
                Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in
-               says what failed: 'grid' (no waveform), 'facility' or 'task' (set aside before it ended).
+               says what failed: 'grid' (no waveform), 'start' (a facility without an equilibrium before the
+               fault), 'facility' (a run that ended early) or 'task' (set aside before it ended).
 `waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave,
 else those
                of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The
@@ -42,6 +44,12 @@ binding and
                flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed; search (JSON),
                of method 'frontier', how it was found: candidates, refused, gap, settled, by_sequence, margins
                (that bind: period, fault, site, target, label, price, by_beta, mechanism).
+`system_plans` the largest plan of a mode and rating whose loss of all sites together stays within a limit in
+               every fault; sites may fail singly. mode, beta, limit_name, limit_mw and limit_share (of the load
+               before the fault; the other is 0); the columns of `plans` from hosting to ac_status; passed,
+               n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses (JSON),
+               one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole); search as in
+               `plans`.
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
                (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
                unit, studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
@@ -68,7 +76,9 @@ from dcvrt.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 3
+VERSION = 4
+RUN_FAILED = ("start", "facility")
+"""Values of `failed_in` of facility runs that have no result."""
 """Of the tables below; a store of another version is refused."""
 
 TABLES = {
@@ -108,6 +118,12 @@ TABLES = {
     "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
     "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, "
     "search TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (method, mode, beta)",
+    "system_plans": "mode TEXT NOT NULL, beta REAL NOT NULL, limit_name TEXT NOT NULL, limit_mw REAL NOT NULL, "
+    "limit_share REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, by_site TEXT NOT NULL, "
+    "binding TEXT NOT NULL, closed TEXT NOT NULL, ac_passed INTEGER, ac_v_min_pu REAL, ac_v_error_pu REAL, "
+    "ac_status TEXT, worst TEXT NOT NULL DEFAULT '{}', replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
+    "n_failed INTEGER NOT NULL DEFAULT 0, aggregate_loss_mw REAL, losses TEXT NOT NULL DEFAULT '[]', "
+    "search TEXT NOT NULL, PRIMARY KEY (mode, beta, limit_mw, limit_share)",
     "what_ifs": "mode TEXT NOT NULL, number INTEGER NOT NULL, label TEXT NOT NULL, changes TEXT NOT NULL, "
     "method TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
     "n_waveforms INTEGER NOT NULL, low REAL NOT NULL, high REAL NOT NULL, rating REAL, "
@@ -124,6 +140,7 @@ JSON_COLUMNS = {
     "worst",
     "search",
     "changes",
+    "losses",
 }
 
 
@@ -296,11 +313,12 @@ class Store:
         """Every hosting vector: samples and plans."""
         return self._frame("hostings", order="role DESC, name")
 
-    def margins(self, role: str | None = None, hosting: str | None = None) -> pd.DataFrame:
-        """Every checked facility run; of hosting vectors of a role only, or of one vector."""
+    def margins(self, role: str | None = None, hosting: str | Sequence[str] | None = None) -> pd.DataFrame:
+        """Every checked facility run; of hosting vectors of a role only, or of one vector or some."""
+        names = [hosting] if isinstance(hosting, str) else hosting
         conditions = {
             "hosting IN (SELECT name FROM hostings WHERE role = ?)": role,
-            "hosting = ?": hosting,
+            "hosting IN (SELECT value FROM json_each(?))": None if names is None else json.dumps(list(names)),
         }
         given = {text: value for text, value in conditions.items() if value is not None}
         return self._frame(
@@ -321,6 +339,10 @@ class Store:
     def plans(self) -> pd.DataFrame:
         """Every plan with its power-flow check and its replay."""
         return self._frame("plans", order="method, mode, beta")
+
+    def system_plans(self) -> pd.DataFrame:
+        """Every plan under a system limit."""
+        return self._frame("system_plans", order="mode, beta, limit_share, limit_mw")
 
     def what_ifs(self) -> pd.DataFrame:
         """Least ratings under varied assumptions, by mode; number 0 is the study as it is."""

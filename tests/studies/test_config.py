@@ -61,7 +61,12 @@ def test_the_canonical_form_leaves_out_what_decides_nothing() -> None:
         "a",
     )
     reseeded = config.load(changed(("seed = 1", "seed = 2")), "a")
-    asked = config.load(changed(("loss_share = 0.20", "loss_share = 0.21")), "a")
+    asked = config.load(
+        changed(("loss_share = 0.20", "loss_share = 0.21"), ("[replay]", "[system_limit]\nloss_mw = [7.0]\n[replay]"))
+        if "[system_limit]" not in config.template()
+        else changed(("loss_share = 0.20", "loss_share = 0.21"), ("loss_mw = [", "loss_mw = [0.5, ")),
+        "a",
+    )
     assert file.canonical() == renamed.canonical() == asked.canonical() != reseeded.canonical()
     assert file.what_if != asked.what_if
 
@@ -83,8 +88,8 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
     assert complaint(text) == (
         "my.toml: 7 problems\n"
         "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
-        "sampling, surrogate, frontier, replay, run, "
-        "fault, period, ... (13 in all).\n"
+        "sampling, surrogate, frontier, system_limit, replay, run, "
+        "fault, ... (14 in all).\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
         "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "
         "step_s, redispatch.\n"

@@ -25,7 +25,14 @@ def frontier(findings: Findings) -> Safe:
         "paper": "samples of the paper's method",
         "frontier": "search of the frontier, all with gradients",
         "replay": "replays of both methods",
-    }
+    } | (
+        {
+            "system_search": "search under system limits, all with gradients",
+            "system_replay": "replays of its candidates",
+        }
+        if findings.system_limits["rows"]
+        else {}
+    )
     false = [row for row in found["rows"] if row["paper"]["false_pass"]]
     ratio = found["ratio"]
     unsettled = [row for row in found["rows"] if not row["settled"]]

@@ -8,6 +8,7 @@ from dcvrt.errors import first_sentence
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
+from dcvrt.studies.store import RUN_FAILED
 from dcvrt.studies.style import mode_name
 
 if TYPE_CHECKING:

@@ -1,0 +1,105 @@
+"""Plans under a limit on the load that all sites together lose at once: which are wanted, and what came of
+them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from dcvrt.planning.exact import Run
+from dcvrt.planning.requirement import Requirement, SystemLimit
+from dcvrt.planning.search import Found
+from dcvrt.studies import phases
+from dcvrt.studies.phases import Setting
+from dcvrt.studies.store import Store, records
+
+ROLES = ("system search", "system candidate")
+"""Roles of the hosting vectors that are simulated for these plans alone, and of those replayed for them."""
+
+
+def wanted(setting: Setting) -> list[tuple[Run, Requirement]]:
+    """Every limit of the study file with every mode and rating that it is tried on."""
+    asked = setting.file.system_limit
+    limits = [SystemLimit(setting.sites, setting.d, mw=mw) for mw in asked.loss_mw]
+    limits += [SystemLimit(setting.sites, setting.d, share=share) for share in asked.loss_share]
+    runs = [run for run in setting.runs if asked.beta is None or run[1] in asked.beta]
+    return [(run, limit) for run in runs for limit in limits]
+
+
+def plan_row(setting: Setting, limit: Requirement, found: Found) -> dict[str, Any]:
+    """The row of `system_plans` of what was found, before its checks."""
+    assert isinstance(limit, SystemLimit)
+    row = phases.plan_row(setting, "", found.mode, found.beta, found.plan, found.closed, None)
+    del row["method"], row["carried_from"]
+    return row | {
+        "limit_name": limit.name,
+        "limit_mw": limit.mw,
+        "limit_share": limit.share,
+        "search": told(found),
+    }
+
+
+def told(found: Found) -> dict[str, Any]:
+    """How a plan was found, as plain data."""
+    return {
+        "candidates": found.candidates,
+        "refused": found.failed,
+        "gap": found.gap,
+        "settled": found.settled,
+        "by_sequence": list(found.by_sequence),
+        "margins": [asdict(margin) for margin in found.binding],
+    }
+
+
+def system_limits(store: Store) -> dict[str, Any]:
+    """Plans under system limits, beside those whose every site rides through, as plain data.
+
+    Returns
+    -------
+    dict
+        `rows`, by mode, rating and rising limit: mode, beta, limit (name), limit_mw, limit_share; total_mw,
+        by_site, closed; passed (the replay; None where nothing is hosted), aggregate_loss_mw (the largest of
+        the replay), losses (one by one: period, fault, loss_mw, limit_mw, whole: sites that lose all), lost_whole
+        (sites that do so in any), n_failed; price_mw_per_mw: hosted MW gained for each MW more that may be lost,
+        0 where the limit does not bind; candidates, refused, gap, settled, by_sequence, margins of the search.
+        `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier of the same modes and
+        ratings, whose sites each meet their own criteria.
+    """
+    rows = [_row(plan) for plan in records(store.system_plans())]
+    runs = dict.fromkeys((row["mode"], row["beta"]) for row in rows)
+    every = [p for p in records(store.plans()) if p["method"] == "frontier" and (p["mode"], p["beta"]) in runs]
+    return {
+        "rows": rows,
+        "every_site": [
+            {name: p[name] for name in ("mode", "beta", "total_mw")}
+            | {"passed": _passed(p), "aggregate_loss_mw": p["aggregate_loss_mw"]}
+            for p in every
+        ],
+    }
+
+
+def _row(plan: Mapping[str, Any]) -> dict[str, Any]:
+    search = plan["search"]
+    return {
+        "mode": plan["mode"],
+        "beta": plan["beta"],
+        "limit": plan["limit_name"],
+        "limit_mw": plan["limit_mw"],
+        "limit_share": plan["limit_share"],
+        "total_mw": plan["total_mw"],
+        "by_site": plan["by_site"],
+        "closed": plan["closed"],
+        "passed": _passed(plan),
+        "aggregate_loss_mw": plan["aggregate_loss_mw"] if plan["total_mw"] > 0 else 0.0,
+        "losses": plan["losses"],
+        "lost_whole": sorted({bus for entry in plan["losses"] for bus in entry["whole"]}),
+        "n_failed": plan["n_failed"],
+        "ac_passed": bool(plan["ac_passed"]),
+        "price_mw_per_mw": sum(item["price"] for item in search["margins"]),
+        **{name: search[name] for name in ("candidates", "refused", "gap", "settled", "by_sequence", "margins")},
+    }
+
+
+def _passed(plan: Mapping[str, Any]) -> bool | None:
+    return bool(plan["passed"]) if plan["total_mw"] > 0 else None
