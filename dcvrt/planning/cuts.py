@@ -14,7 +14,7 @@ between the two takes its place (`Separation`), unless the tangent there does.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,7 +78,7 @@ class Knowledge:
     requirement : what has to be met.
     run : mode and rating ratio.
     points : margins by period and fault, in the order in which they were simulated.
-    allowance : by margin, how much less the replay has found, as a share of its size; 0 where it is not named.
+    allowance : by margin, how much less the replay has found, as a share of its size; 0 where not named.
     separations : cuts at changes of the event sequence.
     """
 

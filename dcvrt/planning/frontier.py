@@ -110,7 +110,7 @@ def frontiers(
             learn_allowance(knowledge, map(requirement.margins, seen), options.margin)
         searches.append(Search(problem, upper, knowledge, known.replayed[run], options))
     results: dict[int, Found] = {}
-    begun = range(len(searches))
+    begun = list(range(len(searches)))
     while begun:
         results |= _ended(searches, begun, known, simulate, replay, lambda n: progress(n, len(searches)))
         begun = [k for k, search in enumerate(searches) if search.overtaken() is not None]
@@ -137,12 +137,14 @@ def _ended(
                 results[k] = end.value
                 del going[k]
                 progress(len(searches) - len(going))
-        _answer({k: (searches[k].knowledge.run, ask) for k, ask in asked.items()}, searches, known, simulate, replay)
+        _answer(
+            [(searches[k].knowledge.run, ask) for k, ask in asked.items()], searches, known, simulate, replay
+        )
     return results
 
 
 def _answer(
-    asked: Mapping[int, tuple[Run, Ask]],
+    asked: Sequence[tuple[Run, Ask]],
     searches: Sequence[Search],
     known: Known,
     simulate: Answer,
@@ -151,13 +153,13 @@ def _answer(
     """Put the questions of a round together and give every search what comes of them."""
     wanted: dict[Vector, dict[Place, None]] = {}
     replays: dict[Vector, None] = {}
-    for _, ask in asked.values():
+    for _, ask in asked:
         if ask.places is None:
             replays[ask.H] = None
         else:
             wanted.setdefault(ask.H, {}).update(dict.fromkeys(ask.places))
     # Those still searching may come to the same vector: a fault is simulated once for all of them.
-    everyone = tuple(dict.fromkeys(run for run, _ in asked.values()))
+    everyone = tuple(dict.fromkeys(run for run, _ in asked))
     questions = [(Ask(H, tuple(places)), everyone) for H, places in wanted.items()]
     for found in simulate(questions) if questions else ():
         _learn(known, searches, found)

@@ -1,4 +1,4 @@
-r"""What a plan has to meet under every fault in every period, as margins that the frontier search can cut with.
+r"""What a plan has to meet under every fault in every period, as margins that a search can cut with.
 
 Two requirements are told apart by who bears the risk. `EverySite`: each open site meets its own criteria,
 
@@ -47,8 +47,8 @@ class Margins:
     by_beta : array (margins,)
         Derivative by the rating ratio.
     size : array (margins,)
-        What tolerances of a margin are shares of: 1 for a margin of one site, the load P before the fault, MW,
-        for the loss of all of them.
+        What tolerances of a margin are shares of: 1 for a margin of one site; the load P before the fault,
+        MW, for the loss of all of them.
     size_slope : array (margins, sites)
         Its derivative by every H_j; size is affine in H.
     words : tuple of str
@@ -166,7 +166,7 @@ class EverySite(Requirement):
             np.ones(m),
             np.zeros((m, n)),
             tuple(map(_course, one.sequence, one.status)),
-            np.isnan(one.value).any(axis=1),
+            np.asarray(np.isnan(one.value).any(axis=1)),
         )
 
     def label(self, number: int) -> str:
@@ -191,10 +191,10 @@ class SystemLimit(Requirement):
         \frac{\partial L}{\partial H_j} = d s_j + \sum_i d H_i \frac{\partial s_i}{\partial H_j}
 
     in MW. A site counts as lost whole (s_i = 1) when its run ended before its time, or when its IT voltage
-    stays below what keeps servers running: they drop off, whatever the converter still draws. So does one that
-    visits BATTERY, by its own loss. There L jumps, and the gradient, which holds within the sequence of modes
-    of all sites together, says nothing of it. A site without a waveform, or without an equilibrium before the
-    fault, is no load that could be lost: it cannot be open.
+    stays below what keeps servers running: they drop off, whatever the converter still draws. One that visits
+    BATTERY loses all by its own share. There L jumps, and the gradient, which holds within the sequence of
+    modes of all sites together, says nothing of it. A site without a waveform, or without an equilibrium
+    before the fault, is no load that could be lost: it cannot be open.
 
     Parameters
     ----------

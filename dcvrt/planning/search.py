@@ -222,7 +222,7 @@ class Search:
         return None
 
     def _adopt(self) -> None:
-        """Take over a larger plan that another search has replayed, with prices of the programme around it."""
+        """Take over a larger plan that was replayed for another search, with the prices around it."""
         larger = self.overtaken()
         if larger is not None:
             H, judged = larger

@@ -7,6 +7,7 @@ simulator; any other is read and initialised by it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,12 +125,6 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                 "frontier.search = true: needs gradients, which grid.engine = 'andes' does not give. "
                 "Way out: grid.engine = 'native', or search = false."
             )
-        limits: SystemLimitSection | None = sections.get("system_limit")
-        if limits is not None and (limits.loss_mw or limits.loss_share) and not getattr(frontier, "search", True):
-            problems.append(
-                "system_limit: its plans are searched like the frontier, and frontier.search = false. Way out: "
-                "search = true, or no limits."
-            )
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
             problems += [
@@ -172,17 +167,24 @@ def wrong_limits(sections: Mapping[str, Any]) -> list[str]:
     """System limits that are given twice or out of order, or at ratings that the study does not have."""
     limits: SystemLimitSection | None = sections.get("system_limit")
     facility: FacilitySection | None = sections.get("facility")
+    frontier: FrontierSection | None = sections.get("frontier")
     if limits is None:
         return []
     listed = {"loss_mw": limits.loss_mw, "loss_share": limits.loss_share, "beta": limits.beta or []}
     problems = [
         f"system_limit.{name} = {values}: must rise from one value to the next."
         for name, values in listed.items()
-        if any(b <= a for a, b in zip(values, values[1:], strict=False))
+        if any(b <= a for a, b in itertools.pairwise(values))
     ]
+    if (limits.loss_mw or limits.loss_share) and frontier is not None and not frontier.search:
+        problems.append(
+            "system_limit: its plans are searched after the frontier, and frontier.search = false. Way out: "
+            "search = true, or no limits."
+        )
     if facility is not None:
+        known = [f"{beta:g}" for beta in facility.beta]
         problems += [
-            f"system_limit.beta[{k}] = {beta:g}: is not among facility.beta.{did_you_mean(beta, facility.beta)}"
+            f"system_limit.beta[{k}] = {beta:g}: is not in facility.beta.{did_you_mean(f'{beta:g}', known)}"
             for k, beta in enumerate(limits.beta or [], start=1)
             if beta not in facility.beta
         ]

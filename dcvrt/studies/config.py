@@ -175,7 +175,7 @@ class FrontierSection(Section):
 
 
 class SystemLimitSection(Section):
-    """`[system_limit]`: plans whose sites may fail singly, as long as the load that is lost at once stays small."""
+    """`[system_limit]`: plans whose sites may fail singly, within a limit on the load lost at once."""
 
     loss_mw: list[NotNegative] = Field(
         default=[], description="limits on the load that all sites together lose in one fault, MW, rising"
@@ -255,8 +255,8 @@ class StudyFile(BaseModel):
         """Everything that decides a plan of the study, as plain data: `[run]`, the name, `[system_limit]` and
         `[[what_if]]` do not.
 
-        System limits and what-ifs are asked once the plans are there, so that a folder may be asked again with
-        others.
+        System limits and what-ifs are asked once the plans are there, so that a folder may be asked again
+        with others.
         """
         data = self.model_dump(mode="json")
         del data["run"], data["what_if"], data["system_limit"], data["study"]["name"]

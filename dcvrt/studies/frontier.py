@@ -61,8 +61,7 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
     within = search(limits, "system limits") if limits else []
     rows = [_plan_row(setting, one) for one in found]
     limited = [
-        system_limit.plan_row(setting, limit, one)
-        for (_, limit), one in zip(limits, within, strict=True)
+        system_limit.plan_row(setting, limit, one) for (_, limit), one in zip(limits, within, strict=True)
     ]
     checked: dict[str, dict[str, Any]] = {}
     for row, one in zip([*rows, *limited], [*found, *within], strict=True):

@@ -204,8 +204,9 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
         for plan in limited:
             rows = runs_of.get((plan["hosting"], plan["mode"], plan["beta"]), [])
             limit = SystemLimit(setting.sites, setting.d, plan["limit_mw"], plan["limit_share"])
-            exact = [one for some in exact_of(rows, setting.sites, _hosted(plan, setting)).values() for one in some]
-            found = replay.limit_verdict(exact, limit, places if plan["total_mw"] > 0 else 0)
+            exact = exact_of(rows, setting.sites, _hosted(plan, setting))
+            replayed = exact.get((plan["mode"], plan["beta"]), [])
+            found = replay.limit_verdict(replayed, limit, places if plan["total_mw"] > 0 else 0)
             store.put("system_plans", [plan | found | {"replayed": 1}])
     return lost
 

@@ -44,11 +44,11 @@ binding and
                flow, with the fields of `dcvrt.planning.reactive.ReactiveExcess`}}, n_failed; search (JSON),
                of method 'frontier', how it was found: candidates, refused, gap, settled, by_sequence, margins
                (that bind: period, fault, site, target, label, price, by_beta, mechanism).
-`system_plans` the largest plan of a mode and rating whose loss of all sites together stays within a limit in
-               every fault; sites may fail singly. mode, beta, limit_name, limit_mw and limit_share (of the load
-               before the fault; the other is 0); the columns of `plans` from hosting to ac_status; passed,
-               n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses (JSON),
-               one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole); search as in
+`system_plans` the largest plan of a mode and rating whose loss of all sites together stays within a limit
+               in every fault; sites may fail singly. mode, beta, limit_name, limit_mw and limit_share (of the
+               load before the fault; the other is 0); the columns of `plans` from hosting to ac_status;
+               passed, n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses
+               (JSON), one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole); search as in
                `plans`.
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
                (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
@@ -118,8 +118,9 @@ TABLES = {
     "worst_voltage_margin_pu REAL, worst_loss_margin_mw REAL, aggregate_loss_mw REAL, "
     "worst TEXT NOT NULL DEFAULT '{}', n_failed INTEGER NOT NULL DEFAULT 0, "
     "search TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (method, mode, beta)",
-    "system_plans": "mode TEXT NOT NULL, beta REAL NOT NULL, limit_name TEXT NOT NULL, limit_mw REAL NOT NULL, "
-    "limit_share REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, by_site TEXT NOT NULL, "
+    "system_plans": "mode TEXT NOT NULL, beta REAL NOT NULL, limit_name TEXT NOT NULL, "
+    "limit_mw REAL NOT NULL, limit_share REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
+    "by_site TEXT NOT NULL, "
     "binding TEXT NOT NULL, closed TEXT NOT NULL, ac_passed INTEGER, ac_v_min_pu REAL, ac_v_error_pu REAL, "
     "ac_status TEXT, worst TEXT NOT NULL DEFAULT '{}', replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
     "n_failed INTEGER NOT NULL DEFAULT 0, aggregate_loss_mw REAL, losses TEXT NOT NULL DEFAULT '[]', "

@@ -60,15 +60,17 @@ def system_limits(store: Store) -> dict[str, Any]:
     dict
         `rows`, by mode, rating and rising limit: mode, beta, limit (name), limit_mw, limit_share; total_mw,
         by_site, closed; passed (the replay; None where nothing is hosted), aggregate_loss_mw (the largest of
-        the replay), losses (one by one: period, fault, loss_mw, limit_mw, whole: sites that lose all), lost_whole
-        (sites that do so in any), n_failed; price_mw_per_mw: hosted MW gained for each MW more that may be lost,
-        0 where the limit does not bind; candidates, refused, gap, settled, by_sequence, margins of the search.
+        the replay), losses (one by one: period, fault, loss_mw, limit_mw, whole: sites that lose all),
+        lost_whole (sites that do so in any), n_failed; price_mw_per_mw: hosted MW gained for each MW more
+        that may be lost, 0 where the limit does not bind; candidates, refused, gap, settled, by_sequence, margins
+        of the search.
         `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier of the same modes and
         ratings, whose sites each meet their own criteria.
     """
     rows = [_row(plan) for plan in records(store.system_plans())]
     runs = dict.fromkeys((row["mode"], row["beta"]) for row in rows)
-    every = [p for p in records(store.plans()) if p["method"] == "frontier" and (p["mode"], p["beta"]) in runs]
+    plans = [p for p in records(store.plans()) if p["method"] == "frontier"]
+    every = [p for p in plans if (p["mode"], p["beta"]) in runs]
     return {
         "rows": rows,
         "every_site": [
@@ -97,7 +99,7 @@ def _row(plan: Mapping[str, Any]) -> dict[str, Any]:
         "n_failed": plan["n_failed"],
         "ac_passed": bool(plan["ac_passed"]),
         "price_mw_per_mw": sum(item["price"] for item in search["margins"]),
-        **{name: search[name] for name in ("candidates", "refused", "gap", "settled", "by_sequence", "margins")},
+        **search,
     }
 
 

@@ -115,7 +115,11 @@ def test_labels_and_units() -> None:
     every, system = EverySite(SITES), SystemLimit(SITES, D, mw=12.5, share=0.05)
     assert [every.label(k) for k in (0, 3)] == ["voltage at bus 21", "loss at bus 75"]
     assert [every.unit(k) for k in (0, 3)] == ["pu", "share of load"]
-    assert (system.label(0), system.target(0), system.unit(0)) == ("loss of all sites", "aggregate loss", "MW")
+    assert (system.label(0), system.target(0), system.unit(0)) == (
+        "loss of all sites",
+        "aggregate loss",
+        "MW",
+    )
     assert system.name == "12.5 MW and 5 % of the load"
     assert SystemLimit(SITES, D).name == "0 MW"
 

@@ -50,6 +50,7 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         internal_response,
         network_map,
         supervisor,
+        system_limit,
         validation,
         what_if,
         worst,
@@ -79,6 +80,9 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         run, _ = internal_response.on_test_waveform(findings, mode)
         if run is not None:
             yield f"internal_response_{mode}", internal_response.draw(findings, mode, run)
+    tradeoff = system_limit.draw(findings)
+    if tradeoff is not None:
+        yield "system_limit", tradeoff
     tornado = what_if.draw(findings)
     if tornado is not None:
         yield "what_if", tornado

@@ -11,7 +11,18 @@ from string import Template
 from dcvrt.studies.figures import draw_all
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.outputs import write_atomically
-from dcvrt.studies.report import answer, checks, frontier, grid, hypotheses, models, plans, record, what_if
+from dcvrt.studies.report import (
+    answer,
+    checks,
+    frontier,
+    grid,
+    hypotheses,
+    models,
+    plans,
+    record,
+    system_limit,
+    what_if,
+)
 from dcvrt.studies.report.page import Safe, escape
 
 REPORT = "report.html"
@@ -19,6 +30,7 @@ REPORT = "report.html"
 SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     answer.answer,
     frontier.frontier,
+    system_limit.system_limit,
     plans.plans,
     plans.failures,
     plans.closed_sites,
