@@ -48,8 +48,8 @@ binding and
                in every fault; sites may fail singly. mode, beta, limit_name, limit_mw and limit_share (of the
                load before the fault; the other is 0); the columns of `plans` from hosting to ac_status;
                passed, n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses
-               (JSON), one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole); search as in
-               `plans`.
+               (JSON), one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole);
+               search as in `plans`.
 `what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
                (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
                unit, studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;

@@ -62,8 +62,8 @@ def system_limits(store: Store) -> dict[str, Any]:
         by_site, closed; passed (the replay; None where nothing is hosted), aggregate_loss_mw (the largest of
         the replay), losses (one by one: period, fault, loss_mw, limit_mw, whole: sites that lose all),
         lost_whole (sites that do so in any), n_failed; price_mw_per_mw: hosted MW gained for each MW more
-        that may be lost, 0 where the limit does not bind; candidates, refused, gap, settled, by_sequence, margins
-        of the search.
+        that may be lost, 0 where the limit does not bind; candidates, refused, gap, settled, by_sequence,
+        margins of the search.
         `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier of the same modes and
         ratings, whose sites each meet their own criteria.
     """

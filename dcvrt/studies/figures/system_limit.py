@@ -32,25 +32,18 @@ MANY = 4
 def curve(rows: Sequence[dict[str, Any]]) -> tuple[list[float], list[float]]:
     """The plans that passed as a curve: loss at once in the replay, MW, and hosted capacity, MW.
 
-    Each plan stands at what it loses, which is less than its limit where the network decides; the last one
-    holds up to the largest limit. Limits in MW and as a share of the load lie on the same curve: a plan that
-    is the largest for its share is the largest for what it loses.
+    Each plan stands at what it loses, which is less than its limit where the network decides. Limits in MW
+    and as a share of the load lie on the same curve: a plan that is the largest for its share is the largest
+    for what it loses.
 
-    >>> plan = {"passed": True, "aggregate_loss_mw": 8.0, "total_mw": 90.0, "limit_mw": 20.0}
-    >>> nothing = {"passed": None, "aggregate_loss_mw": 0.0, "total_mw": 0.0, "limit_mw": 0.0}
-    >>> curve([plan, nothing])
-    ([0.0, 8.0, 20.0], [0.0, 90.0, 90.0])
+    >>> plan = {"passed": True, "aggregate_loss_mw": 8.0, "total_mw": 90.0}
+    >>> nothing = {"passed": None, "aggregate_loss_mw": 0.0, "total_mw": 0.0}
+    >>> curve([plan, nothing, plan])
+    ([0.0, 8.0], [0.0, 90.0])
     """
-    points = sorted(
-        {(row["aggregate_loss_mw"], row["total_mw"]) for row in rows if row["passed"] or not row["total_mw"]}
-    )
-    if not points:
-        return [], []
-    widest = max([row["limit_mw"] for row in rows if row["passed"]], default=0.0)
-    if widest > points[-1][0]:
-        points.append((widest, points[-1][1]))
-    loss, total = zip(*points, strict=True)
-    return list(loss), list(total)
+    passed = [row for row in rows if row["passed"] or not row["total_mw"] > 0]
+    points = sorted({(row["aggregate_loss_mw"], row["total_mw"]) for row in passed})
+    return [loss for loss, _ in points], [total for _, total in points]
 
 
 def draw(findings: Findings) -> Figure | None:
@@ -64,13 +57,15 @@ def draw(findings: Findings) -> Figure | None:
         return None
     figure = new_figure(PAGE, 3.0)
     panels = figure.subplots(1, len(findings.modes), sharex=True, sharey=True, squeeze=False)[0]
+    losses = [row["aggregate_loss_mw"] or 0.0 for name in ("rows", "every_site") for row in found[name]]
+    edge = 1.2 * max([*losses, 1.0])
+    panels[0].set_xlim(-0.02 * edge, edge)
     for axes, mode, letter in zip(panels, findings.modes, letters(), strict=False):
         axes.axhline(findings.no_vrt_mw, color=GREY, linewidth=1.0, linestyle=(0, (6, 2)))
         _curves(axes, findings, mode)
         axes.set_xlabel("load lost at once in the worst fault (MW)")
         panel(axes, letter, mode_name(mode))
     panels[0].set_ylabel("hosted capacity (MW)")
-    panels[0].set_xlim(left=-0.02 * panels[0].get_xlim()[1])
     panels[0].set_ylim(-0.03 * findings.no_vrt_mw, 1.08 * max(findings.no_vrt_mw, panels[0].dataLim.ymax))
     failed = any(row["passed"] is False for name in ("rows", "every_site") for row in found[name])
     figure.legend(handles=_handles(failed), loc="outside lower center", ncols=4)
@@ -89,7 +84,10 @@ def _curves(axes: Axes, findings: Findings, mode: str) -> None:
         marker = MARKERS[k % len(MARKERS)]
         rows = [row for row in found["rows"] if (row["mode"], row["beta"]) == (mode, beta)]
         loss, total = curve(rows)
-        axes.plot(loss, total, color=colour, marker=marker, label=f"β = {beta:g}", zorder=3, clip_on=False)
+        axes.plot(loss, total, color=colour, marker=marker, label=f"β = {beta:g}", zorder=3)
+        widest = max([row["limit_mw"] for row in rows if row["passed"]], default=0.0)
+        if loss and widest > loss[-1]:  # the network decides: as much up to the largest limit
+            axes.plot([loss[-1], min(widest, axes.get_xlim()[1])], [total[-1]] * 2, color=colour, zorder=2.5)
         every = [r for r in found["every_site"] if (r["mode"], r["beta"]) == (mode, beta) and r["passed"]]
         axes.plot(
             [row["aggregate_loss_mw"] for row in every],
