@@ -490,7 +490,7 @@ def limit_verdict(replayed: Sequence[Exact], limit: SystemLimit, expected: int) 
     n_failed = expected - len(losses)
     return {
         "passed": passed and n_failed == 0,
-        "aggregate_loss_mw": max((entry["loss_mw"] for entry in losses), default=None),
+        "aggregate_loss_mw": max((e["loss_mw"] for e in losses), default=None) if expected else 0.0,
         "losses": losses,
         "n_failed": n_failed,
     }

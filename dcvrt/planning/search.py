@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import InputError
-from dcvrt.planning.cuts import Key, Knowledge, separation
+from dcvrt.planning.cuts import SETTLED, Key, Knowledge, separation
 from dcvrt.planning.exact import Exact, Place
 from dcvrt.planning.plan import Plan, Row
 from dcvrt.planning.requirement import Margins
@@ -212,14 +212,22 @@ class Search:
         return self._found(gap, settled)
 
     def overtaken(self) -> tuple[Floats, tuple[Margins, ...]] | None:
-        """The largest vector that was replayed, meets the requirement and hosts more than the best plan."""
+        """The largest vector that was replayed, meets the requirement and hosts more than the best plan.
+
+        Only where the network allows it: coarse samples need not keep to that.
+        """
         for H in sorted(self.replayed, key=sum, reverse=True):
             if sum(H) <= self.best.plan.total_mw + 1e-6:
                 return None
             judged = self._judged(H)
-            if self._passes_replay(judged):
+            if self._passes_replay(judged) and self._allowed(H):
                 return np.array(H), judged
         return None
+
+    def _allowed(self, H: Vector) -> bool:
+        """Whether the hosting programme would host as much, without anything that has to be met in faults."""
+        bounds = {bus: (0.0, mw) for bus, mw in zip(self.problem.sites, H, strict=True)}
+        return self.problem.solve(rows=(), bounds=bounds).total_mw >= sum(H) - SETTLED
 
     def _adopt(self) -> None:
         """Take over a larger plan that was replayed for another search, with the prices around it."""

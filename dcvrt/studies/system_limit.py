@@ -93,7 +93,7 @@ def _row(plan: Mapping[str, Any]) -> dict[str, Any]:
         "by_site": plan["by_site"],
         "closed": plan["closed"],
         "passed": _passed(plan),
-        "aggregate_loss_mw": plan["aggregate_loss_mw"] if plan["total_mw"] > 0 else 0.0,
+        "aggregate_loss_mw": plan["aggregate_loss_mw"],
         "losses": plan["losses"],
         "lost_whole": sorted({bus for entry in plan["losses"] for bus in entry["whole"]}),
         "n_failed": plan["n_failed"],

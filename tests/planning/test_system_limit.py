@@ -283,6 +283,15 @@ def test_the_same_answer_in_whatever_order_the_questions_are_answered() -> None:
     assert plans[0][:3] == plans[0][3:]  # the stand-in knows no modes
 
 
+def test_a_sample_that_the_network_does_not_allow_is_no_plan() -> None:
+    """It was replayed and would meet the limit; its total is beyond what the programme hosts."""
+    programme = Programme(2, 60.0)
+    oracle = Oracle(programme, shares(np.array([[0.1, 0.1]]), np.zeros((1, 2, 2))), ["0"])
+    (found,) = closed_form.search(programme, oracle, [100.0, 100.0], limits(programme, [1e4]))
+    assert found.plan.total_mw == pytest.approx(60.0)
+    assert found.settled
+
+
 def test_nothing_hosted_is_never_excluded() -> None:
     """Shares that fall as load is added: tangents, taken at their word, would deny even an empty system."""
     programme = Programme(2, 1e9)

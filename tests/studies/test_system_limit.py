@@ -1,0 +1,358 @@
+"""Plans under system limits in a study: searched, replayed, judged, written, drawn and told."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from dcvrt import cli
+from dcvrt.planning import replay
+from dcvrt.studies import frontier, outputs, phases
+from dcvrt.studies.campaign import Campaign, crew_of
+from dcvrt.studies.comparison import comparison
+from dcvrt.studies.config import SystemLimitSection
+from dcvrt.studies.figures import system_limit as picture
+from dcvrt.studies.findings import Findings
+from dcvrt.studies.phases import Setting
+from dcvrt.studies.progress import Silent
+from dcvrt.studies.report import system_limit as page
+from dcvrt.studies.store import Store, records
+from dcvrt.studies.study import Result
+from dcvrt.studies.style import styled
+from tests.planning.closed_form import Programme
+from tests.studies.synthetic import CORNER, PERIODS, SITES, SLOPE, checked_run, make, study_file
+
+LOSS_MW, LOSS_SHARE = [0.0, 15.0, 40.0, 500.0], [0.1, 1.0]
+WORSE = 0.005
+"""How much more of its import a site loses in the replay than in the search."""
+
+
+class Capped(Programme):
+    """Sites of the synthetic study under one limit on their total, as a hosting problem."""
+
+    def __init__(self) -> None:
+        super().__init__(len(SITES), 0.8 * sum(CORNER))
+        self.sites = SITES
+        self.upper = np.array(CORNER)
+
+    def solve(self, rows: Any = (), bounds: Any = None) -> Any:
+        bounds = bounds or {bus: (0.0, mw) for bus, mw in zip(SITES, CORNER, strict=True)}
+        return super().solve(rows, bounds)
+
+
+def answers(file: Any, asked: list[dict[str, Any]], worse: float = WORSE) -> Any:
+    """`check_hosting` by the closed form of the synthetic study; the replay finds a little more loss."""
+
+    def check_hosting(request: dict[str, Any]) -> dict[str, Any]:
+        asked.append(request)
+        H, period = np.array(request["hosting"]), request["period"]["name"]
+        buses = [fault["bus"] for fault in request["faults"]]
+        rows = []
+        for fault in [fault for fault in file.fault if fault.bus in buses]:
+            for k, site in enumerate(SITES):
+                for mode, beta in request["runs"]:
+                    row = checked_run(file, period, fault, site, mode, beta, H)
+                    more = 0.0 if request["gradients"] else worse
+                    share = row["loss_share"] + more
+                    row |= {"loss_share": share, "loss_margin_share": row["loss_margin_share"] - more}
+                    row |= {"loss_mw": row["p_mw"] * share, "gradients": {}}
+                    if request["gradients"]:
+                        row["gradients"] = gradients(k, row, beta, PERIODS[period][2])
+                    rows.append(row)
+        return {"rows": rows, "waveforms": [], "grid": len(buses), "facility": len(rows)}
+
+    return check_hosting
+
+
+def gradients(k: int, row: dict[str, Any], beta: float, d: float) -> dict[str, dict[str, float]]:
+    """Derivatives of the static law: V falls by SLOPE per MW at the site and a fifth of that elsewhere."""
+    v = {f"H_{s}": -SLOPE * d * (1.0 if j == k else 0.2) for j, s in enumerate(SITES)}
+    active = float(beta * row["v_poi_min_pu"] < 1.0)
+    loss = {name: active * beta * slope for name, slope in v.items()}
+    return {
+        "voltage": {name: 0.25 * slope for name, slope in loss.items()} | {"beta": 0.0},
+        "loss": loss | {"beta": active * row["v_poi_min_pu"]},
+        "v_poi": v,
+    }
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    requests: list[dict[str, Any]] = []
+    monkeypatch.setattr(replay, "check_hosting", answers(study_file("limits"), requests))
+    monkeypatch.setattr(phases, "power_flow", lambda problem, plan: {"ac_passed": 1, "ac_status": "made up"})
+    return requests
+
+
+def setting(**changes: Any) -> Setting:
+    file = study_file("limits")
+    limits = SystemLimitSection(
+        **{"loss_mw": LOSS_MW, "loss_share": LOSS_SHARE, "beta": [1.15, 1.35]} | changes
+    )
+    periods = {
+        name: {"name": name, "hour": hour, "load_scale": load, "dc_factor": d, "wind": {}}
+        for name, (hour, load, d, _) in PERIODS.items()
+    }
+    problem = Capped()
+    no_vrt = SimpleNamespace(by_site=dict(zip(SITES, CORNER, strict=True)), total_mw=sum(CORNER))
+    file = file.model_copy(update={"system_limit": limits})
+    return Setting(file, Path(), problem, periods, no_vrt)  # type: ignore[arg-type]
+
+
+def run(folder: Path, study: Setting) -> list[dict[str, Any]]:
+    """Search and replay; the plans under limits."""
+    folder.mkdir(exist_ok=True)
+    with Store(folder / "study.sqlite", write=True) as store, crew_of(1) as crew:
+        campaign = Campaign(store, crew)
+        assert frontier.run_frontier(campaign, study, Silent()) == []
+        assert phases.run_replays(campaign, study) == []
+        return records(store.system_plans())
+
+
+def test_every_limit_has_a_plan_that_the_replay_passes(tmp_path: Path, asked: list) -> None:
+    study = setting()
+    plans = run(tmp_path, study)
+    assert len(plans) == 2 * 2 * 6
+    for plan in plans:
+        key = (plan["mode"], plan["beta"], plan["limit_name"])
+        assert plan["replayed"] == 1, key
+        if not plan["total_mw"]:
+            continue
+        assert plan["passed"] == 1, key
+        assert len(plan["losses"]) == len(PERIODS) * len(study.file.fault)
+        H = np.array([plan["by_site"][str(bus)] for bus in SITES])
+        for entry in plan["losses"]:  # against the closed form, not through the code under test
+            d = PERIODS[entry["period"]][2]
+            fault = next(f for f in study.file.fault if replay.fault_label(f.model_dump()) == entry["fault"])
+            shares = [
+                checked_run(study.file, entry["period"], fault, s, plan["mode"], plan["beta"], H)[
+                    "loss_share"
+                ]
+                for s in SITES
+            ]
+            expected = d * float(H @ (np.array(shares) + WORSE))
+            allowed = plan["limit_mw"] + plan["limit_share"] * d * H.sum()
+            assert entry["loss_mw"] == pytest.approx(expected, abs=1e-9)
+            assert entry["limit_mw"] == pytest.approx(allowed)
+            assert entry["loss_mw"] <= allowed
+        assert plan["aggregate_loss_mw"] == max(entry["loss_mw"] for entry in plan["losses"])
+
+
+def test_capacity_rises_with_the_limit_up_to_what_the_network_takes(tmp_path: Path, asked: list) -> None:
+    plans = run(tmp_path, setting())
+    for mode in ("gfl", "gfm"):
+        for beta in (1.15, 1.35):
+            here = [p for p in plans if (p["mode"], p["beta"], p["limit_share"]) == (mode, beta, 0.0)]
+            totals = [p["total_mw"] for p in sorted(here, key=lambda p: p["limit_mw"])]
+            assert totals[0] == 0.0
+            assert totals == sorted(totals)
+            assert totals[-1] == pytest.approx(0.8 * sum(CORNER))
+            (everything,) = [
+                p for p in plans if (p["mode"], p["beta"], p["limit_share"]) == (mode, beta, 1.0)
+            ]
+            assert everything["total_mw"] == pytest.approx(totals[-1])
+
+
+def test_limits_change_nothing_of_the_frontier_and_simulate_nothing_twice(
+    tmp_path: Path, asked: list
+) -> None:
+    def found(folder: Path, study: Setting) -> list[tuple]:
+        run(folder, study)
+        with Store(folder / "study.sqlite") as store:
+            return [(p["mode"], p["beta"], p["by_site"]) for p in records(store.plans())]
+
+    without = found(tmp_path / "without", setting(loss_mw=[], loss_share=[]))
+    asked.clear()
+    assert found(tmp_path / "with", setting()) == without
+    faults = [
+        (r["engine"], tuple(r["hosting"]), r["period"]["name"], fault["bus"], tuple(map(tuple, r["runs"])))
+        for r in asked
+        for fault in r["faults"]
+    ]
+    assert len(faults) == len(set(faults))
+
+
+def test_a_finished_search_asks_nothing_more_and_another_limit_asks_for_itself(
+    tmp_path: Path, asked: list
+) -> None:
+    first = run(tmp_path, setting())
+    asked.clear()
+    assert run(tmp_path, setting()) == first
+    assert asked == []
+    fewer = run(tmp_path, setting(loss_mw=[15.0, 25.0], loss_share=[]))
+    assert {p["limit_name"] for p in fewer} == {"15 MW", "25 MW"}
+    before = {(p["mode"], p["beta"]): p["by_site"] for p in first if p["limit_name"] == "15 MW"}
+    after = {(p["mode"], p["beta"]): p["by_site"] for p in fewer if p["limit_name"] == "15 MW"}
+    assert after.keys() == before.keys()
+    for run_, by_site in after.items():
+        assert sum(by_site.values()) == pytest.approx(sum(before[run_].values()), rel=0.005)
+
+
+def test_what_limits_take_is_counted_apart(tmp_path: Path, asked: list) -> None:
+    run(tmp_path / "without", setting(loss_mw=[], loss_share=[]))
+    run(tmp_path / "with", setting())
+    spent = []
+    for name in ("without", "with"):
+        with Store(tmp_path / name / "study.sqlite") as store:
+            spent.append(comparison(store)["simulations"])
+    assert spent[0]["frontier"] == spent[1]["frontier"]
+    assert spent[0]["system_search"]["grid"] == spent[0]["system_replay"]["grid"] == 0
+    assert spent[1]["system_replay"]["grid"] > 0
+
+
+# -- verdict, tables, figure and page ------------------------------------------------------------------------
+
+
+LIMITED = (
+    # limit, MW at bus 75, passed, lost at once, lost whole, settled, refused searches' text
+    (0.0, 0.0, 1, 0.0, [], True, []),
+    (20.0, 90.0, 1, 19.9, [75], True, ["loss of all sites: bus 75: NORMAL becomes NORMAL>BATTERY"]),
+    (40.0, 120.0, 0, 43.0, [], False, []),
+    (80.0, 150.0, 1, 61.0, [], True, []),
+)
+
+
+def put_limits(store: Store, runs: list[tuple[str, float]]) -> None:
+    for mode, beta in runs:
+        for mw, hosted, passed, lost, whole, settled, sequence in LIMITED:
+            losses = [
+                {"period": "peak", "fault": "bus 65, 100 ms", "loss_mw": lost, "limit_mw": mw, "whole": whole}
+            ]
+            by_site = {str(bus): hosted if bus == 75 else 0.0 for bus in SITES}
+            store.put("system_plans", [{
+                "mode": mode, "beta": beta, "limit_name": f"{mw:g} MW", "limit_mw": mw, "limit_share": 0.0,
+                "hosting": phases.plan_name(by_site), "total_mw": hosted, "by_site": by_site, "binding": [],
+                "closed": {}, "ac_passed": 1, "ac_status": "made up", "replayed": 1, "passed": passed,
+                "aggregate_loss_mw": lost, "losses": losses if hosted else [],
+                "search": {"candidates": 1, "refused": 0, "gap": 0.0, "settled": settled,
+                           "by_sequence": sequence, "margins": [{"price": 2.5}] if mw == 20.0 else []},
+            }])  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    make(tmp_path, failing=False)
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        for plan in records(store.plans()):
+            if plan["method"] == "paper":
+                store.put("plans", [plan | {"method": "frontier", "search": {"margins": []}}])
+        put_limits(store, [("gfl", 1.15), ("gfl", 1.35), ("gfm", 1.15), ("gfm", 1.35)])
+        outputs.write_results(tmp_path, store)
+    return tmp_path
+
+
+def test_the_verdict_counts_what_is_missing_and_what_has_no_result() -> None:
+    from dcvrt.planning.requirement import SystemLimit
+    from tests.planning.test_requirement import SITES as BUSES
+    from tests.planning.test_requirement import D, exact
+
+    limit = SystemLimit(BUSES, D, mw=30.0)
+    fine = exact([10.0, 20.0, 0.0], [[0.1, 0.2]] * 3, [0.25, 1.0, 0.1])
+    found = replay.limit_verdict([fine], limit, 1)
+    assert found["passed"]
+    assert found["aggregate_loss_mw"] == pytest.approx(0.8 * 22.5)
+    assert found["losses"] == [
+        {"period": "peak", "fault": "a", "loss_mw": pytest.approx(18.0), "limit_mw": 30.0, "whole": [75]}
+    ]
+    assert not replay.limit_verdict([fine], limit, 2)["passed"]
+    assert replay.limit_verdict([fine], limit, 2)["n_failed"] == 1
+    unknown = exact([10.0, 20.0, 0.0], [[0.1, 0.2], [np.nan, np.nan], [0.1, 0.2]], [0.25, np.nan, 0.1])
+    found = replay.limit_verdict([unknown], limit, 1)
+    assert (found["passed"], found["n_failed"], found["aggregate_loss_mw"]) == (False, 1, None)
+    too_much = exact([100.0, 20.0, 0.0], [[0.1, 0.2]] * 3, [0.25, 1.0, 0.1])
+    assert not replay.limit_verdict([too_much], limit, 1)["passed"]
+    assert replay.limit_verdict([], limit, 0)["passed"]
+
+
+def test_tables_tell_the_plans_and_their_verdicts(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    row = next(
+        r for r in summary["system_limit"] if (r["mode"], r["beta"], r["limit"]) == ("gfl", 1.15, "20 MW")
+    )
+    assert row["total_mw"] == 90.0
+    assert row["passed"] is True
+    assert row["lost_whole"] == [75]
+    assert row["price_mw_per_mw"] == 2.5
+    assert not any("system" in r["method"] for r in summary["rows"])
+    full = json.loads((folder / "frontier.json").read_text())["system_limit"]
+    assert {r["limit"] for r in full["rows"]} == {"0 MW", "20 MW", "40 MW", "80 MW"}
+    assert len(full["every_site"]) == 4
+    table = Result(folder).table()
+    mine = table[table.method == "system limit 40 MW"]
+    assert set(mine.replay) == {"failed"}
+    assert set(mine.bus_75_mw) == {120.0}
+
+
+def test_the_curve_leaves_out_what_failed_and_the_figure_crosses_it_out(folder: Path) -> None:
+    findings = Findings(folder)
+    rows = [r for r in findings.system_limits["rows"] if (r["mode"], r["beta"]) == ("gfl", 1.15)]
+    assert picture.curve(rows) == ([0.0, 19.9, 61.0], [0.0, 90.0, 150.0])
+    with styled():
+        figure = picture.draw(findings)
+    assert figure is not None
+    assert len(figure.axes) == 2
+    for axes in figure.axes:
+        labels = axes.get_legend_handles_labels()[1]
+        assert labels == ["β = 1.15", "β = 1.35"]
+        crosses = [line for line in axes.lines if line.get_marker() == "x"]
+        assert [line.get_xydata().tolist() for line in crosses] == [[[43.0, 120.0]], [[43.0, 120.0]]]
+        assert axes.get_xlim()[1] > 61.0
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts == [
+        "without ride-through", "within a limit on the loss at once", "every site rides through",
+        "failed the replay",
+    ]  # fmt: skip
+
+
+def test_the_page_tells_the_trade_off_and_what_it_rests_on(folder: Path) -> None:
+    text = page.system_limit(Findings(folder))
+    assert "4 plan(s) within a limit failed the replay and must not be used" in text
+    assert "GFL at β 1.15 within 40 MW: 120.0 MW, loses 43.0 MW at once" in text
+    assert "GFL, β = 1.15: within 20 MW: 90.0 MW, 80 MW: 150.0 MW." in text
+    assert "Searches that ended before nothing was left to gain: GFL at β 1.15 within 40 MW" in text
+    assert "bus 75: NORMAL becomes NORMAL&gt;BATTERY" in text
+    assert "both read in secondary sources" in text
+
+
+def test_sentences_compare_with_sites_that_all_ride_through() -> None:
+    found = {
+        "rows": [
+            {"mode": "gfl", "beta": 1.1, "limit": "20 MW", "total_mw": 90.0, "passed": True},
+            {"mode": "gfm", "beta": 1.1, "limit": "20 MW", "total_mw": 0.0, "passed": None},
+        ],
+        "every_site": [
+            {"mode": "gfl", "beta": 1.1, "total_mw": 50.0, "passed": True, "aggregate_loss_mw": 12.0},
+            {"mode": "gfm", "beta": 1.1, "total_mw": 0.0, "passed": None, "aggregate_loss_mw": 0.0},
+        ],
+    }
+    assert page.sentences(found) == [
+        "GFL, β = 1.1: within 20 MW: 90.0 MW. With every site riding through 50.0 MW, of which up to 12.0 MW "
+        "are lost at once.",
+        "GFM, β = 1.1: no limit lets it host. With every site riding through nothing can be hosted.",
+    ]
+
+
+def test_without_limits_there_is_neither_page_nor_figure(tmp_path: Path) -> None:
+    findings = Findings(make(tmp_path))
+    assert page.system_limit(findings) == ""
+    assert picture.draw(findings) is None
+    assert json.loads((tmp_path / "summary.json").read_text())["system_limit"] == []
+
+
+def test_a_failed_plan_under_a_limit_ends_as_a_failed_plan_elsewhere(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Shown as failed; the exit code is that of the study, as for every other plan."""
+    shutil.copy(folder / "study.sqlite", folder / "kept.sqlite")
+    cli._show(Result(folder))
+    assert "system limit 40 MW" in capsys.readouterr().out
+    with pytest.raises(typer.Exit) as ended:
+        cli._show(Result(folder, ["candidates task: timeout"]))
+    assert ended.value.exit_code == cli.INCOMPLETE
