@@ -20,8 +20,10 @@ import numpy as np
 from benchmarks.harness import Result, result
 from dcvrt.planning import replay
 from dcvrt.planning.exact import Exact, Run, exact_of
-from dcvrt.planning.frontier import Ask, frontiers
+from dcvrt.planning.frontier import frontiers
 from dcvrt.planning.kept import side_by_side
+from dcvrt.planning.requirement import EverySite
+from dcvrt.planning.search import Ask
 from dcvrt.planning.surrogate import MarginData, fit_surrogates
 from dcvrt.planning.sweep import sweep
 from dcvrt.studies import Study
@@ -51,8 +53,8 @@ def run(smoke: bool = False) -> list[Result]:
     start = time.perf_counter()
     places = [(period, label) for period in setting.periods for label in spent.labels]
     found = frontiers(
-        setting.problem, setting.runs, setting.problem.upper, coarse_samples(setting), places,
-        spent.simulate, spent.replay,
+        setting.problem, [(run, EverySite(setting.sites)) for run in setting.runs], setting.problem.upper,
+        coarse_samples(setting), places, spent.simulate, spent.replay,
     )  # fmt: skip
     frontier_s, search_grid = time.perf_counter() - start, spent.grid
 
@@ -118,9 +120,12 @@ class Counter:
             for ask, runs in questions
         ]
 
-    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[list[dict[str, Any]]]:
+    def replay(self, questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[Mapping[Run, Sequence[Exact]]]:
         """Replay plans; not counted, as both methods' plans are replayed alike."""
-        return [self.rows(ask.H, runs, False, count=False) for ask, runs in questions]
+        return [
+            exact_of(self.rows(ask.H, runs, False, count=False), self.setting.sites, ask.H)
+            for ask, runs in questions
+        ]
 
     def passes(self, H: Sequence[float], run: Run) -> bool:
         """Whether a plan passes the replay."""

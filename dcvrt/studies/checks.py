@@ -182,9 +182,9 @@ def wrong_limits(sections: Mapping[str, Any]) -> list[str]:
             "search = true, or no limits."
         )
     if facility is not None:
-        known = [f"{beta:g}" for beta in facility.beta]
+        known = ", ".join(f"{beta:g}" for beta in facility.beta)
         problems += [
-            f"system_limit.beta[{k}] = {beta:g}: is not in facility.beta.{did_you_mean(f'{beta:g}', known)}"
+            f"system_limit.beta[{k}] = {beta:g}: is not in facility.beta, which has {known}."
             for k, beta in enumerate(limits.beta or [], start=1)
             if beta not in facility.beta
         ]

@@ -9,7 +9,9 @@ import pytest
 
 from dcvrt.planning import replay
 from dcvrt.planning.exact import Exact, Run, exact_of
-from dcvrt.planning.frontier import Ask, frontiers, meets
+from dcvrt.planning.frontier import frontiers
+from dcvrt.planning.requirement import EverySite, SystemLimit
+from dcvrt.planning.search import Ask
 from dcvrt.studies import Study
 
 SITES = (2, 7, 13, 16, 20, 21, 28, 39, 43, 48, 51, 57, 67, 75, 84, 93, 98, 106, 108, 114)
@@ -38,21 +40,32 @@ def test_twenty_sites_are_searched_and_pass() -> None:
     def simulate(questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[dict[Run, list[Exact]]]:
         return [exact_of(rows(ask, runs, True), SITES, ask.H) for ask, runs in questions]
 
+    def replayed(questions: Sequence[tuple[Ask, Sequence[Run]]]) -> list[dict[Run, list[Exact]]]:
+        return [exact_of(rows(ask, runs, False), SITES, ask.H) for ask, runs in questions]
+
     corner = np.maximum([setting.no_vrt.by_site[bus] for bus in SITES], 1.0)
     found = frontiers(
         setting.problem,
-        [("gfl", 1.15), ("gfl", 1.3)],
+        [
+            (("gfl", 1.15), EverySite(SITES)),
+            (("gfl", 1.3), EverySite(SITES)),
+            (("gfl", 1.15), SystemLimit(SITES, setting.d, mw=20.0)),
+        ],
         setting.problem.upper,
         [corner, np.ones(len(SITES))],
         [(period, label) for label in labels],
         simulate,
-        lambda questions: [rows(ask, runs, False) for ask, runs in questions],
+        replayed,
     )
     for one in found:
         assert one.settled
-        assert all(meets(row) for row in one.certificate)
+        assert len(one.certificate) == len(labels)
+        assert not any(margins.missed() for margins in one.certificate)
         assert 0 < one.plan.total_mw <= setting.no_vrt.total_mw + 1e-3
-        n_open = sum(mw > 0 for mw in one.plan.by_site.values())
-        assert len(one.certificate) == n_open * len(labels)
         assert set(one.closed) == {bus for bus, mw in one.plan.by_site.items() if mw == 0}
-    assert found[0].plan.total_mw < found[1].plan.total_mw
+    each, larger_rating, together = found
+    assert each.plan.total_mw < larger_rating.plan.total_mw
+    # Every site may lose a quarter of its load; 20 MW of all the load are less, and sites share them.
+    for margins in together.certificate:
+        share = margins.at.loss @ margins.H / margins.H.sum()
+        assert share * margins.size[0] <= 20.0

@@ -232,12 +232,18 @@ def test_the_page_tells_the_trade_off_and_what_it_rests_on(folder: Path) -> None
     assert "Searches that ended before nothing was left to gain: GFL at β 1.15 within 40 MW" in text
     assert "bus 75: NORMAL becomes NORMAL&gt;BATTERY" in text
     assert "both read in secondary sources" in text
+    assert "Tried at 2 of the 4 ratings studied: 1.15, 1.35." in text
+
+
+def loses(mw: float) -> dict[str, Any]:
+    return {"passed": True, "aggregate_loss_mw": mw}
 
 
 def test_sentences_compare_with_sites_that_all_ride_through() -> None:
     found = {
         "rows": [
-            {"mode": "gfl", "beta": 1.1, "limit": "20 MW", "total_mw": 90.0, "passed": True},
+            loses(10.0) | {"mode": "gfl", "beta": 1.1, "limit": "10 MW", "total_mw": 90.0},
+            loses(30.0) | {"mode": "gfl", "beta": 1.1, "limit": "30 MW", "total_mw": 99.0},
             {"mode": "gfm", "beta": 1.1, "limit": "20 MW", "total_mw": 0.0, "passed": None},
         ],
         "every_site": [
@@ -246,8 +252,8 @@ def test_sentences_compare_with_sites_that_all_ride_through() -> None:
         ],
     }
     assert page.sentences(found) == [
-        "GFL, β = 1.1: within 20 MW: 90.0 MW. With every site riding through 50.0 MW, of which up to 12.0 MW "
-        "are lost at once.",
+        "GFL, β = 1.1: within 10 MW: 90.0 MW, 30 MW: 99.0 MW. With every site riding through 50.0 MW, of "
+        "which up to 12.0 MW are lost at once. Within 10 MW more is hosted and less is lost.",
         "GFM, β = 1.1: no limit lets it host. With every site riding through nothing can be hosted.",
     ]
 

@@ -35,6 +35,7 @@ def system_limit(findings: Findings) -> Safe:
             "secondary sources). What may be lost depends on the system behind it; no limit of this study is "
             "a recommendation."
         ),
+        paragraph(_tried(findings)),
     ]
     failed = [row for row in rows if row["passed"] is False]
     if failed:
@@ -78,6 +79,21 @@ def system_limit(findings: Findings) -> Safe:
     return section(TITLE, *parts, *_reservations(rows), name=ANCHOR)
 
 
+def _tried(findings: Findings) -> str:
+    """Which of the ratings studied the limits were tried at."""
+    tried = sorted({row["beta"] for row in findings.system_limits["rows"]})
+    studied = findings.study.facility.beta
+    said = (
+        f"Tried at {len(tried)} of the {len(studied)} ratings studied: {', '.join(f'{b:g}' for b in tried)}."
+    )
+    if len(tried) < len(studied):
+        said += (
+            " [system_limit] of the study file takes more ratings and limits; the same folder may be run again "
+            "with them."
+        )
+    return said
+
+
 def sentences(found: Mapping[str, Any]) -> list[str]:
     """For each mode and rating, what the limits allow beside what sites that all ride through do."""
     every = {(row["mode"], row["beta"]): row for row in found["every_site"]}
@@ -93,6 +109,14 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
                 f" With every site riding through {alone['total_mw']:.1f} MW, of which up to "
                 f"{alone['aggregate_loss_mw']:.1f} MW are lost at once."
             )
+            better = [
+                row
+                for row in rows
+                if row["total_mw"] > alone["total_mw"]
+                and row["aggregate_loss_mw"] < alone["aggregate_loss_mw"]
+            ]
+            if better:
+                text += f" Within {better[-1]['limit']} more is hosted and less is lost."
         elif alone is not None and alone["passed"] is None:
             text += " With every site riding through nothing can be hosted."
         said.append(text)
