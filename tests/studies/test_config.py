@@ -110,8 +110,8 @@ def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
         "  system_limit.loss_share = [0.2, 0.1]: must rise from one value to the next.\n"
         "  system_limit: its plans are searched after the frontier, and frontier.search = false. Way out: "
         "search = true, or no limits.\n"
-        "  system_limit.beta[1] = 1.16: is not in facility.beta, which has 1, 1.05, 1.1, 1.125, 1.15, 1.175, 1.2, "
-        "1.25, 1.3, 1.35, 1.4, 1.5."
+        "  system_limit.beta[1] = 1.16: is not in facility.beta, which has 1, 1.05, 1.1, 1.125, 1.15, 1.175, "
+        "1.2, 1.25, 1.3, 1.35, 1.4, 1.5."
     )
 
 

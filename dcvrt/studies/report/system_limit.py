@@ -88,8 +88,8 @@ def _tried(findings: Findings) -> str:
     )
     if len(tried) < len(studied):
         said += (
-            " [system_limit] of the study file takes more ratings and limits; the same folder may be run again "
-            "with them."
+            " [system_limit] of the study file takes more ratings and limits; the same folder may be run "
+            "again with them."
         )
     return said
 
