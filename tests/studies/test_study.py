@@ -38,6 +38,10 @@ beta = [1.1, 1.4]
 n = 6
 validation_share = 0.2
 
+[system_limit]
+loss_mw = [5.0]
+beta = [1.1]
+
 [[fault]]
 bus = 25
 
@@ -226,6 +230,7 @@ def test_a_study_on_one_and_two_workers_and_after_a_kill_gives_the_same(tmp_path
     for role in ("sample", "plan"):
         with Store(tmp_path / "one" / "study.sqlite") as s, Store(tmp_path / "two" / "study.sqlite") as t:
             assert s.margins(role).equals(t.margins(role))
+            assert s.system_plans().equals(t.system_plans())
 
     check_summary(a)
     stored = json.loads((tmp_path / "one" / "summary.json").read_text())
@@ -253,9 +258,14 @@ def finished(folder: Path, seconds: bool = False) -> set:
 
 def check_summary(summary: dict) -> None:
     """The keys that programs rely on, and what must be true of every study."""
-    assert set(summary) == {"no_vrt", "rows", "surrogate", "simulations", "wall_s", "versions"}
+    assert set(summary) == {
+        "no_vrt", "rows", "system_limit", "surrogate", "simulations", "wall_s", "versions",
+    }  # fmt: skip
     assert set(summary["no_vrt"]) == {"total_mw", "by_site"}
     assert set(summary["simulations"]) == {"grid", "facility", "failed", "quarantined"}
+    (limited,) = summary["system_limit"]
+    assert limited["passed"] is True
+    assert 0.0 < limited["aggregate_loss_mw"] <= limited["limit_mw"]
     totals: dict[tuple[str, str], list[float]] = {}
     for row in summary["rows"]:
         assert set(row) == {"mode", "beta", "method", "total_mw", "by_site", "binding", "replay", "ac"}
