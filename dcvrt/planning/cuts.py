@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.errors import first_sentence
 from dcvrt.planning.exact import Exact, Place, Run
 from dcvrt.planning.plan import Row
 from dcvrt.planning.requirement import Margins, Requirement
@@ -228,7 +229,7 @@ class Knowledge:
         """A site that is unknown wherever it was simulated does not pass."""
         for place, points in self.points.items():
             for site in np.flatnonzero(np.all([one.unknown for one in points], axis=0)).tolist():
-                bus, why = self.sites[site], points[0].at.status[site]
+                bus, why = self.sites[site], first_sentence(points[0].at.status[site])
                 yield Row({bus: 0.0}, 1.0, f"no margin known, bus {bus}, {self._where(place)}: {why}", bus)
 
     def _row(self, a: Floats, lower: float, key: Key, by_sequence: bool = False) -> Row:

@@ -102,13 +102,14 @@ def frontiers(
             _learn(known, [], found)
         _keep(known, vectors[0], replay([(Ask(vectors[0], None), fresh)])[0])
 
+    nothing = problem.solve(rows=(), bounds=dict.fromkeys(problem.sites, (0.0, 0.0)))
     searches = []
     for run, requirement in wanted:
         knowledge = Knowledge(requirement, run)
         knowledge.learn(known.simulated[run])
         for seen in known.replayed[run].values():
             learn_allowance(knowledge, map(requirement.margins, seen), options.margin)
-        searches.append(Search(problem, upper, knowledge, known.replayed[run], options))
+        searches.append(Search(problem, upper, knowledge, known.replayed[run], nothing, options))
     results: dict[int, Found] = {}
     begun = list(range(len(searches)))
     while begun:

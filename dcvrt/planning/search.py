@@ -174,6 +174,7 @@ class Search:
         Largest capacities, MW.
     knowledge : what was simulated for the mode and rating; its owner adds to it.
     replayed : what was replayed for them, by whichever search; its owner adds to it.
+    nothing : the plan that hosts nothing, which it starts from.
     options : Options
     """
 
@@ -183,13 +184,13 @@ class Search:
         box: Floats,
         knowledge: Knowledge,
         replayed: Mapping[Vector, Sequence[Exact]],
+        nothing: Plan,
         options: Options,
     ) -> None:
         self.problem, self.box, self.knowledge = problem, box, knowledge
         self.replayed, self.options = replayed, options
         self.tried = self.refused = 0
-        nothing = {bus: (0.0, 0.0) for bus in problem.sites}
-        self.best = Passed(problem.solve(rows=(), bounds=nothing), np.zeros(len(box)))
+        self.best = Passed(nothing, np.zeros(len(box)))
 
     def run(self) -> Generator[Ask, None, Found]:
         """Ask until nothing is left to gain; to be run again when `overtaken`."""
