@@ -255,7 +255,9 @@ class Search:
         return False
 
     def _worth(self, plan: Plan) -> bool:
-        return plan.total_mw > self.best.plan.total_mw * (1.0 + self.options.gain) + 1e-6
+        """Whether a plan is enough larger than the best: by the gain, and by what the programme can tell."""
+        told = SETTLED * len(self.problem.sites)
+        return plan.total_mw > self.best.plan.total_mw * (1.0 + self.options.gain) + told
 
     def _propose(self, centre: Floats | None = None, radius: float = 1.0, local: bool = False) -> Plan:
         """The hosting programme under the cuts, in the whole box or in a trust region around a centre.

@@ -101,7 +101,7 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
 def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
     text = changed(
         ("loss_mw = [0.0, 20.0, 80.0]", "loss_mw = [20.0, 20.0]\nloss_share = [0.2, 0.1]"),
-        ("beta = [1.15, 1.3]", "beta = [1.16]"),
+        ("beta = [1.15] ", "beta = [1.16] "),
         ("search = true", "search = false"),
     )
     assert complaint(text) == (
