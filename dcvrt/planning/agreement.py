@@ -33,7 +33,9 @@ MARGIN = 0.01
 screen proves wrong by half of it somewhere."""
 STEEP = 3e-4
 """Hours closer to a limit than this get new slopes, pu."""
-PASSES = 40
+PASSES = 200
+"""Linearisations before it is given up: with fewer limits that bind than sites they come nearer by a constant
+factor only."""
 HALVINGS = 10
 """Halved steps towards sizes without a solution before they count as out of reach."""
 
@@ -47,10 +49,19 @@ class Agreement:
     earlier passes stay as cuts while they exclude nothing that AC power flow allows (`Tangent.bounds`); with
     voltages concave in H that is always so, and the passes converge also where fewer limits bind than there
     are sites.
+
+    Parameters
+    ----------
+    screen : VoltageScreen
+    repeat : bool
+        Whether the screen is moved at all; else one look tells how wrong it is.
+    thorough : bool
+        Whether every hour that may be near a limit is solved; else only the hours in which the screen has
+        each bus nearest: what it then agrees to is to be confirmed by `allows`.
     """
 
-    def __init__(self, screen: VoltageScreen, repeat: bool) -> None:
-        self.screen, self.repeat = screen, repeat
+    def __init__(self, screen: VoltageScreen, repeat: bool = True, thorough: bool = True) -> None:
+        self.screen, self.repeat, self.thorough = screen, repeat, thorough
         self.passes, self.checked = 0, 0
         self.guard = GUARD
         self.error, self.lowest, self.highest = 0.0, np.nan, np.nan
@@ -90,11 +101,13 @@ class Agreement:
 
     def _compare(self, solution: Solution, master: Master) -> bool:
         tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        look: _Look | None = None
         if self.repeat and tangents:
-            first = self._glance(solution.H, tangents)
-            if self._overstates(first) > AGREED_AT_LIMITS:
-                return self._move(solution.H, first, master)
-        look = self._look(solution.H, tangents)
+            look = self._glance(solution.H, tangents)
+            if self._overstates(look) > AGREED_AT_LIMITS:
+                return self._move(solution.H, look, master)
+        if look is None or self.thorough:
+            look = self._look(solution.H, tangents)
         self.checked = len(look.hours)
         size = self.screen.sizes(look.solved)
         self.lowest, self.highest = float(size.min()), float(size.max())
@@ -122,9 +135,9 @@ class Agreement:
         """Linearise again at `H` and renew the cuts of `master`."""
         screen, hours = self.screen, look.hours
         size = screen.sizes(look.solved)
-        room = screen.room(size, np.arange(len(size)), hours)
         self.passes += 1
         if self.passes > PASSES:
+            room = screen.room(size, np.arange(len(size)), hours)
             bus, k = np.unravel_index(room.argmin(), room.shape)
             raise SimulationError(
                 f"Voltage screen and AC power flow still differ after {PASSES} linearisations; the voltage "
@@ -132,8 +145,7 @@ class Agreement:
                 f"{screen.network.bus[screen.moving[bus]]} in hour {screen.year.hours[hours[k]]}. "
                 "Ways out: a smaller h_max, or voltage_screen='one-shot' with check_ac."
             )
-        steep = np.flatnonzero(room.min(axis=0) < STEEP)
-        screen.relinearise(H, hours, look.solved, steep, look.rows, look.expected)
+        self._linearise(H, look)
         place = {int(hour): k for k, hour in enumerate(hours)}
 
         def stays(cut: Cut) -> bool:
@@ -149,6 +161,27 @@ class Agreement:
         renewed = [screen.tangent(*key) for key in dict.fromkeys(moved)]
         master.cuts = [cut for cut in master.cuts if stays(cut)]
         master.cuts += [Cut(*t.cut(), origin=t) for t in renewed]
+        return False
+
+    def _linearise(self, H: Floats, look: _Look) -> None:
+        """Move the screen to `H`."""
+        size = self.screen.sizes(look.solved)
+        room = self.screen.room(size, np.arange(len(size)), look.hours)
+        steep = np.flatnonzero(room.min(axis=0) < STEEP)
+        self.screen.relinearise(H, look.hours, look.solved, steep, look.rows, look.expected)
+
+    def allows(self, H: Floats, tangents: list[Tangent]) -> bool:
+        """Whether AC power flow keeps every voltage within its limits at `H`, whatever the screen says.
+
+        Where it does not, the screen is moved there and knows from now on.
+        """
+        try:
+            look = self._look(H, tangents)
+        except SimulationError:
+            return False
+        if self._overstates(look) <= AGREED_AT_LIMITS:
+            return True
+        self._linearise(H, look)
         return False
 
     def restart(self, H: Floats, master: Master) -> bool:
@@ -167,7 +200,9 @@ class Agreement:
         limit: enough to see most limits that the screen lets be broken."""
         screen = self.screen
         rows = screen.near(H, 0.0)
-        worst = screen.room(screen.voltages(H, rows), rows).argmin(axis=1)
+        room = screen.room(screen.voltages(H, rows), rows)
+        self.least_room = np.minimum(room.min(axis=0, initial=MARGIN), MARGIN)
+        worst = room.argmin(axis=1)
         hours = np.unique(np.r_[worst, [t.hour for t in _tight(tangents, H)]].astype(np.int64))
         if not len(hours):
             hours = np.array([tangents[0].hour])

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from dcvrt.errors import first_sentence
 from dcvrt.planning.exact import Exact, Place, Run
-from dcvrt.planning.plan import Row
+from dcvrt.planning.plan import SETTLED, Row
 from dcvrt.planning.requirement import Margins, Requirement
 
 Floats = npt.NDArray[np.float64]
@@ -36,9 +36,6 @@ bind."""
 BACKOFF = 1e-5
 """What a tangent asks for beyond the margin, as a share of its size, so that a plan on it passes in spite of
 its curvature."""
-SETTLED = 2e-3
-"""Distance within which a plan takes the capacities of a simulated point, MW: the hosting programme itself
-knows its optimum no better, as voltages agree with AC power flow to 1e-7 pu."""
 JUMP = 0.1
 """Error of a tangent at a point of another event sequence, as a share of the margin's size, from which on the
 two do not belong to one piece: loss shares move by a few hundredths over all sizes, and by much more where a

@@ -18,7 +18,7 @@ from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import FlowCut
 from dcvrt.planning.master import Cut, Master, Question, Solution
 from dcvrt.planning.objective import MaxMin, MaxTotal, Objective, Rating
-from dcvrt.planning.plan import AcVerdict, Certificate, Plan, Row, VoltageInfo
+from dcvrt.planning.plan import SETTLED, AcVerdict, Certificate, Plan, Row, VoltageInfo
 from dcvrt.planning.profiles import Year
 from dcvrt.planning.security import N1
 from dcvrt.planning.voltage_screen import HostedFlow, Tangent, VoltageScreen
@@ -158,6 +158,7 @@ class HostingProblem:
         objective: Objective | None = None,
         rating: Rating | None = None,
         must_open: Sequence[int] = (),
+        thorough: bool = True,
     ) -> Plan:
         """Find the best plan. Cuts are kept, so that asking again is quick.
 
@@ -176,6 +177,10 @@ class HostingProblem:
             Makes the converter ratings unknowns that rows may contain.
         must_open : sequence of int
             Sites that may not be closed: their smallest sizes and their rows hold whatever it costs.
+        thorough : bool
+            Whether voltages are compared with AC power flow in every hour in which one may be near a limit.
+            Without, only the hours are that the screen has nearest: many times quicker, and the plan may
+            be too large, which `allows` tells and the next solve then knows.
 
         Returns
         -------
@@ -192,7 +197,27 @@ class HostingProblem:
             When voltages do not settle, which happens close to the limit of power transfer.
         """
         question = self._question(rows, bounds or {}, objective, rating, must_open)
-        return self._answer(question)
+        return self._answer(question, thorough)
+
+    def allows(self, hosting: Mapping[int, float]) -> bool:
+        """Whether every hour has a dispatch and AC voltages within all limits at these capacities.
+
+        What is found to be wrong is kept, so that `solve` knows it from then on.
+
+        Parameters
+        ----------
+        hosting : mapping of bus number to MW
+            Sites that are left out host nothing; capacities may be `SETTLED` too large.
+        """
+        H = np.maximum([hosting.get(bus, 0.0) - SETTLED for bus in self.sites], 0.0)
+        hours, screen = self.certifier, self.screen
+        cut = hours.certify(H)
+        if cut is not None:
+            self._flow_cuts.append(cut)
+            return False
+        if screen is None:
+            return True
+        return Agreement(screen).allows(H, [screen.tangent(*key) for key in self._voltage_keys])
 
     def pareto(
         self,
@@ -251,15 +276,15 @@ class HostingProblem:
         forced = np.array([bus in set(must_open) for bus in self.sites])
         return Question(self.sites, lower, upper, rows, objective, rating, forced)
 
-    def _answer(self, question: Question) -> Plan:
+    def _answer(self, question: Question, thorough: bool = True) -> Plan:
         """Solve; for `MaxMin` the total is maximised once the least size is known."""
-        found = self._optimum(question)
+        found = self._optimum(question, thorough)
         if not isinstance(question.objective, MaxMin):
             return found
-        kept = self._optimum(question.with_floor(found.objective))
+        kept = self._optimum(question.with_floor(found.objective), thorough)
         return replace(kept, objective=found.objective)
 
-    def _optimum(self, question: Question) -> Plan:
+    def _optimum(self, question: Question, thorough: bool = True) -> Plan:
         master = question.master()
         hours, screen = self.certifier, self.screen
         master.cuts = [self._as_cut(cut) for cut in self._flow_cuts]
@@ -278,7 +303,8 @@ class HostingProblem:
                 break
             tried.add(tuple(chosen.open))
             floor = -np.inf if best is None else best[0].objective + TOTAL_TOLERANCE
-            agreement = None if screen is None else Agreement(screen, self.voltage_screen == "relinearised")
+            repeat = self.voltage_screen == "relinearised"
+            agreement = None if screen is None else Agreement(screen, repeat, thorough)
             settled = self._settle(master, chosen.open, floor, agreement)
             if settled is not None:
                 best = settled, hours.certificate, None if agreement is None else agreement.info()

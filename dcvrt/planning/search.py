@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import InputError
-from dcvrt.planning.cuts import SETTLED, Key, Knowledge, separation
+from dcvrt.planning.cuts import Key, Knowledge, separation
 from dcvrt.planning.exact import Exact, Place
-from dcvrt.planning.plan import Plan, Row
+from dcvrt.planning.plan import SETTLED, Plan, Row
 from dcvrt.planning.requirement import Margins
 
 Floats = npt.NDArray[np.float64]
@@ -43,9 +43,16 @@ class Problem(Protocol):
         """Candidate buses."""
 
     def solve(
-        self, rows: Iterable[Row] = ..., bounds: Mapping[int, tuple[float, float]] | None = ...
+        self,
+        rows: Iterable[Row] = ...,
+        bounds: Mapping[int, tuple[float, float]] | None = ...,
+        *,
+        thorough: bool = ...,
     ) -> Plan:
-        """The largest plan under rows and bounds."""
+        """The largest plan under rows and bounds; without `thorough` possibly too large."""
+
+    def allows(self, hosting: Mapping[int, float]) -> bool:
+        """Whether the network can host as much, faults aside."""
 
 
 @dataclass(frozen=True)
@@ -221,14 +228,9 @@ class Search:
             if sum(H) <= self.best.plan.total_mw + 1e-6:
                 return None
             judged = self._judged(H)
-            if self._passes_replay(judged) and self._allowed(H):
+            if self._passes_replay(judged) and self._allowed(np.array(H)):
                 return np.array(H), judged
         return None
-
-    def _allowed(self, H: Vector) -> bool:
-        """Whether the hosting programme would host as much, without anything that has to be met in faults."""
-        bounds = {bus: (0.0, mw) for bus, mw in zip(self.problem.sites, H, strict=True)}
-        return self.problem.solve(rows=(), bounds=bounds).total_mw >= sum(H) - SETTLED
 
     def _adopt(self) -> None:
         """Take over a larger plan that was replayed for another search, with the prices around it."""
@@ -245,7 +247,7 @@ class Search:
         while self.tried < self.options.candidates and self._worth(plan):
             self.tried += 1
             H = self.knowledge.settle(vector(plan, self.problem.sites))
-            if (yield from self._passes(H)):
+            if (yield from self._passes(H)) and self._allowed(H):
                 judged = yield from self._replay(H)
                 if judged is not None:
                     self.best = Passed(at(plan, H, self.problem.sites), H, judged)
@@ -270,7 +272,10 @@ class Search:
         high = box if centre is None else np.minimum(centre + reach, box)
         rows = tuple(self.knowledge.rows(box, centre if local else None, reach))
         bounds = {bus: (float(a), float(b)) for bus, a, b in zip(sites, low, high, strict=True)}
-        return self.problem.solve(rows=rows, bounds=bounds)
+        return self.problem.solve(rows=rows, bounds=bounds, thorough=False)
+
+    def _allowed(self, H: Floats) -> bool:
+        return self.problem.allows(dict(zip(self.problem.sites, H.tolist(), strict=True)))
 
     def _passes(self, H: Floats) -> Generator[Ask, None, bool]:
         """Simulate a candidate where a margin may be near; whether all of these are met."""

@@ -29,7 +29,10 @@ class Programme:
         self.weights = np.ones(n) if weights is None else np.asarray(weights)
         self.budget = budget
 
-    def solve(self, rows=(), bounds=None) -> Answer:
+    def allows(self, hosting) -> bool:
+        return self.weights @ [hosting[bus] for bus in self.sites] <= self.budget + 1e-9
+
+    def solve(self, rows=(), bounds=None, thorough=True) -> Answer:
         low = np.array([bounds[bus][0] for bus in self.sites])
         high = np.array([bounds[bus][1] for bus in self.sites])
         master = Master(self.sites, low, high, tuple(rows))

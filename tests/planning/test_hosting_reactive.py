@@ -90,3 +90,31 @@ def test_few_hours_tell_the_voltages_of_all_without_switching() -> None:
 def test_few_hours_are_all_solved() -> None:
     year = YEAR.window(range(8424, 8448))
     assert VoltageDrop(year).sample.tolist() == list(range(24))
+
+
+def test_a_quick_solve_that_is_confirmed_is_the_thorough_one() -> None:
+    """Confirmed, or taught until it is: the same plan from fewer solved hours."""
+    boxes = ({}, {75: (0.0, 60.0)}, {106: (0.0, 0.0)}, {21: (0.0, 5.0), 108: (0.0, 40.0)})
+    quick = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    thorough = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    for box in boxes:
+        plan = quick.solve(bounds=box, thorough=False)
+        for _ in range(10):
+            if quick.allows(plan.by_site):
+                break
+            assert plan.total_mw > thorough.solve(bounds=box).total_mw - 1e-3, (
+                "what is taught only takes away"
+            )
+            plan = quick.solve(bounds=box, thorough=False)
+        assert plan.voltage.checked < len(WEEK)
+        assert quick.check_ac(plan).passed
+        assert plan.total_mw == pytest.approx(thorough.solve(bounds=box).total_mw, abs=1e-2)
+
+
+def test_what_the_network_cannot_host_is_not_allowed() -> None:
+    problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    plan = problem.solve()
+    assert problem.allows(plan.by_site)
+    assert problem.allows({})
+    for bus, mw in plan.by_site.items():
+        assert not problem.allows(plan.by_site | {bus: 1.05 * mw}), bus

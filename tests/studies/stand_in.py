@@ -32,9 +32,9 @@ class Capped(Programme):
         self.sites = SITES
         self.upper = np.array(CORNER)
 
-    def solve(self, rows: Any = (), bounds: Any = None) -> Any:
+    def solve(self, rows: Any = (), bounds: Any = None, thorough: bool = True) -> Any:
         bounds = bounds or {bus: (0.0, mw) for bus, mw in zip(SITES, CORNER, strict=True)}
-        return super().solve(rows, bounds)
+        return super().solve(rows, bounds, thorough)
 
 
 def answers(file: Any, asked: list[dict[str, Any]], worse: float = WORSE) -> Any:
