@@ -14,7 +14,7 @@
 # # A hosting study, small enough to watch
 #
 # How much data-centre load can the IEEE 118-bus system host at two buses, if both sites must ride through two
-# faults? The full study has four sites, seven faults, three periods and eleven ratings; this one takes about a
+# faults? The full study has four sites, seven faults, three periods and twelve ratings; this one takes about a
 # minute and goes through every step of it.
 
 # %%

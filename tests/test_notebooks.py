@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-QUICK = ("01_first_block", "02_build_a_facility", "03_ride_through")
+QUICK = ("01_first_block", "02_build_a_facility", "03_ride_through", "04_fault_on_the_grid")
 LONG = ("05_hosting_study",)
 
 
