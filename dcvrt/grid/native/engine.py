@@ -29,6 +29,9 @@ from dcvrt.models.machines import UnitBlock, alone, setpoints
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
+SEEN_OF_A_FACILITY = 3.0
+"""How much coarser the states of a facility may be than those of machines: the network sees of them the
+current, times size and impedance at the bus, 0.3 pu and less, so that voltages stay as exact."""
 QUANTITY = re.compile(r"(?:(?P<kind>H|wind)_(?P<bus>\d+)|(?P<whole>load|clear))")
 
 
@@ -224,7 +227,7 @@ class Engine:
                 Unit(f"facility {facility.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
                 for bus in buses
             ]
-            made.append(Group(structure, units))
+            made.append(Group(structure, units, tolerance=SEEN_OF_A_FACILITY))
         return tuple(made)
 
     def _structure_of(self, facility: Diagram | Dae) -> Structure:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import SimulationError
-from dcvrt.grid.native.structure import Structure
+from dcvrt.grid.native.structure import Structure, for_units
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -58,11 +58,14 @@ class Group:
     power : str
         Whose power at the bus they feed in: that of its `generation`, of its (negative) `load`, of its
         `wind`.
+    tolerance : float
+        Error of its states in a run, over that of the run's options.
     """
 
     structure: Structure
     units: Sequence[Unit]
     power: str = "generation"
+    tolerance: float = 1.0
 
     @cached_property
     def p(self) -> Floats:
@@ -83,12 +86,12 @@ class Group:
         x = np.tile([row.value for row in self.structure.dae.states], (len(p), 1))
         v = np.tile([1.0, 0.0], (len(p), 1))
         slopes = self._slopes(x, v, p)
-        mean = 0.5 * np.stack([slopes[0, :, 0] + slopes[1, :, 1], slopes[1, :, 0] - slopes[0, :, 1]], axis=1)
+        mean = 0.5 * np.stack([slopes[:, 0, 0] + slopes[:, 1, 1], slopes[:, 1, 0] - slopes[:, 0, 1]], axis=1)
         return np.where(np.isfinite(mean), -mean, 0.0)
 
     def _slopes(self, x: Floats, v: Floats, p: Floats) -> Floats:
-        """di/dv as (2, units, 2)."""
-        return np.array(self.structure.slopes.map(len(p))(x.T, v.T, p.T)).reshape(2, len(p), 2)
+        """di/dv as (units, 2, 2)."""
+        return for_units(self.structure.slopes, x, v, p)[0]
 
     def shunts(self) -> Phasors:
         """Admittance that the network holds for each unit."""
@@ -96,16 +99,13 @@ class Group:
             return self.p[:, -2] + 1j * self.p[:, -1]
         n = len(self.units)
         slopes = self._slopes(np.zeros((n, self.structure.dae.x.numel())), np.zeros((n, 2)), self.p)
-        return -(slopes[0, :, 0] + 1j * slopes[1, :, 0])
+        return -(slopes[:, 0, 0] + 1j * slopes[:, 1, 0])
 
     def held(self, p: Floats) -> Floats:
         """Dwell times (units, rows), s."""
-        rows = len(self.structure.rows)
-        return (
-            np.array(self.structure.held.map(len(p))(p.T)).reshape(rows, len(p)).T
-            if rows
-            else np.zeros((len(p), 0))
-        )
+        if not self.structure.rows:
+            return np.zeros((len(p), 0))
+        return for_units(self.structure.held, p)[0][:, :, 0]
 
     def equilibrium(self, v: Phasors, i: Phasors, where: str) -> Equilibrium:
         """States and set-points at rest, for given terminal voltages and currents into the network.
@@ -116,17 +116,15 @@ class Group:
             When there is none for some unit, with its largest residuals by name; when a limit is exceeded.
         """
         s, n = self.structure, len(self.units)
-        p, columns, nx = self.p.copy(), [s.column(path) for path in s.setpoints], s.dae.x.numel()
-        size = nx + len(columns)
-        volts, current = np.vstack([v.real, v.imag]), np.vstack([i.real, i.imag])
-        x = np.array(s.start.map(n)(volts, p.T)).reshape(nx, n).T.copy()
+        columns, nx = [s.column(path) for path in s.setpoints], s.dae.x.numel()
+        volts, current = (np.stack([a.real, a.imag], axis=1) for a in (v, i))
+        p, x = self.p.copy(), for_units(s.start, volts, self.p)[0][:, :, 0].copy()
         if s.angle:  # the rest is nearly linear once the q-axis is known
             x[:, s.dae.x_names.index(s.angle)] = np.angle(v + 1j * p[:, s.column(s.reactance)] * i)
-        balance = s.balance.map(n)
         last = np.full(n, np.inf)
         for step in range(STEPS + 1):
-            residual, jacobian = (np.array(a) for a in balance(x.T, volts, p.T, current))
-            r, j = residual.T, jacobian.reshape(size, n, size).transpose(1, 0, 2)
+            r, j = for_units(s.balance, x, volts, p, current)
+            r = r[:, :, 0]
             level = np.abs(r).max(axis=1, initial=0.0)
             stalled = step > 3 and bool((level < ACCEPTED).all() and (level >= 0.5 * last).all())
             if (level < TOLERANCE).all() or stalled or not np.isfinite(r).all() or step == STEPS:
@@ -139,13 +137,12 @@ class Group:
             x -= move[:, :nx, 0]
             p[:, columns] -= move[:, nx:, 0]
         self._check(r, where)
-        found = s.at_rest.map(n)(x.T, volts, p.T, current)
-        by_v, guards, moves, now, slopes = (np.array(a) for a in found)
+        by_v, guards, moves, now, slopes = for_units(s.at_rest, x, volts, p, current)
         if s.setpoints:
-            self._check_limits(guards.reshape(-1, n).T, moves.reshape(-1, n).T, where)
+            self._check_limits(guards[:, :, 0], moves[:, :, 0], where)
         return Equilibrium(
-            self, x, p, self._inverse(j), by_v.reshape(size, n, 2).transpose(1, 0, 2), now[0] + 1j * now[1],
-            slopes.reshape(2, n, size + 2).transpose(1, 0, 2), float(level.max(initial=0.0)),
+            self, x, p, self._inverse(j), by_v, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
+            float(level.max(initial=0.0)),
         )  # fmt: skip
 
     def _inverse(self, jacobian: Floats) -> Floats:

@@ -18,7 +18,7 @@ from dcvrt.grid.native.build import unit_objects
 from dcvrt.grid.native.fleet import Equilibrium, Group
 from dcvrt.grid.native.ports import Ports
 from dcvrt.grid.native.run import Fleet, Layout, NetworkTable, Options, Simulated, simulate
-from dcvrt.grid.native.steady import Flow
+from dcvrt.grid.native.steady import Flow, Steady
 from dcvrt.grid.native.structure import SCALE
 from dcvrt.grid.network import Network
 
@@ -161,6 +161,7 @@ class NativePoint:
         at = system.unit_bus[sum(len(g.units) for g in system.groups) :]
         v = np.ones(len(load), dtype=complex)
         drawn = np.zeros(len(at), dtype=complex)
+        steady: Steady | None = None
         for _ in range(ROUNDS):
             fed, first = [], 0
             for group in system.facilities:
@@ -173,8 +174,8 @@ class NativePoint:
             np.add.at(total, at, drawn)
             if len(at) and np.abs(drawn - before).max() < AGREED:
                 return fed
-            self.steady = system.flow.solve(total, rule, reactive_limits, self.where)
-            v = self.steady.v
+            self.steady = steady = system.flow.solve(total, rule, reactive_limits, self.where, steady)
+            v = steady.v
             if not len(at):
                 return fed
         raise SimulationError(

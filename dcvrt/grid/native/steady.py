@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -61,7 +62,12 @@ class Steady:
     at_limit: tuple[int, ...]
     iterations: int
     _equations: Equations
-    _factors: spla.SuperLU
+    _share: Floats
+
+    @cached_property
+    def _factors(self) -> spla.SuperLU:
+        current = self._equations.y @ self.v
+        return spla.splu(self._equations.jacobian(self.v, current, self._share))
 
     def derivatives(self, load: Phasors) -> tuple[Phasors, Phasors]:
         """Derivatives of voltages and generation by parameters that change the load.
@@ -181,7 +187,12 @@ class Flow:
         return self._equations[key]
 
     def solve(
-        self, load: Phasors, rule: str = "proportional", reactive_limits: bool = False, where: str = ""
+        self,
+        load: Phasors,
+        rule: str = "proportional",
+        reactive_limits: bool = False,
+        where: str = "",
+        near: Steady | None = None,
     ) -> Steady:
         """Solve for one load.
 
@@ -195,6 +206,8 @@ class Flow:
             Whether a unit whose reactive power would leave its limits holds the limit instead of the voltage.
         where : str
             What messages call the operating point.
+        near : Steady, optional
+            Where the search begins; at the held voltages when not given.
 
         Raises
         ------
@@ -207,6 +220,8 @@ class Flow:
         network, where = self.network, where or self.network.name
         kind = np.array(network.kind)
         q_fixed, v = np.zeros(len(kind)), network.v_set * np.exp(1j * network.slack_angle)
+        if near is not None:
+            v = np.where(kind == "pq", 1.0, network.v_set / abs(near.v)) * near.v
         found = self._newton(load, kind, q_fixed, rule, v, where)
         if reactive_limits:
             found = self._with_limits(load, kind, q_fixed, rule, found, where)
@@ -305,7 +320,7 @@ class Flow:
             tuple(int(b) for b in network.bus[let_go]),
             step,
             equations,
-            spla.splu(equations.jacobian(v, current, share)),
+            share,
         )
 
 

@@ -8,11 +8,40 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from dcvrt.dae import Dae, Transition
 from dcvrt.errors import ModelError, did_you_mean
 
 SCALE = "scale"
+Floats = npt.NDArray[np.float64]
+
+
+def for_units(function: ca.Function, *values: Floats) -> list[Floats]:
+    """Results of a function of one unit, for many.
+
+    Parameters
+    ----------
+    function : Function
+        With dense results.
+    values : arrays (units, rows)
+
+    Returns
+    -------
+    list of arrays (units, rows, columns)
+    """
+    n = len(values[0])
+    shapes = [function.size_out(k) for k in range(function.n_out())]
+    given = [np.ascontiguousarray(v, dtype=np.float64) for v in values]
+    found = [np.empty((n, columns, rows)) for rows, columns in shapes]
+    # numbers pass through memory: matrices of CasADi are made of them one by one
+    buffer, run = function.map(n).buffer()
+    for k, array in enumerate(given):
+        buffer.set_arg(k, memoryview(array.ravel()))
+    for k, array in enumerate(found):
+        buffer.set_res(k, memoryview(array.ravel()))
+    run()
+    return [array.transpose(0, 2, 1) for array in found]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,36 +1,16 @@
 /* Integrates a fleet through stretches of constant networks: explicit pair of orders 5 and 4, located events,
  * forward sensitivities that cross events with the jump term.
- *
- * J. R. Dormand, P. J. Prince, J. Comp. Appl. Math. 6 (1980) 19-26; dense output: E. Hairer, S. P. Norsett,
- * G. Wanner, Solving Ordinary Differential Equations I, section II.6.
  */
 #include "fleet.h"
+#include "pair.h"
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-enum { STAGES = 7, DENSE = 5, BLOCK = 8, NEWTON = 30, MOST_DIRECTIONS = 64 };
+enum { BLOCK = 8, NEWTON = 30, MOST_DIRECTIONS = 64 };
 #define NEWTON_TOLERANCE 1e-11
 #define SLOW 0.1
-
-static const double NODE[STAGES] = {0.0, 1. / 5, 3. / 10, 4. / 5, 8. / 9, 1.0, 1.0};
-static const double A[STAGES][STAGES - 1] = {
-    {0},
-    {1. / 5},
-    {3. / 40, 9. / 40},
-    {44. / 45, -56. / 15, 32. / 9},
-    {19372. / 6561, -25360. / 2187, 64448. / 6561, -212. / 729},
-    {9017. / 3168, -355. / 33, 46732. / 5247, 49. / 176, -5103. / 18656},
-    {35. / 384, 0.0, 500. / 1113, 125. / 192, -2187. / 6784, 11. / 84},
-};
-static const double ERROR[STAGES] = {71. / 57600,      0.0,       -71. / 16695, 71. / 1920,
-                                     -17253. / 339200, 22. / 525, -1. / 40};
-static const double LAST_TERM[STAGES] = {
-    -12715105075. / 11282082432., 0.0,
-    87487479700. / 32700410799.,  -10690763975. / 1880347072.,
-    701980252875. / 199316789632., -1453857185. / 822651844.,
-    69997945. / 29380423.};
 
 typedef double block __attribute__((vector_size(8 * BLOCK), aligned(8)));
 
@@ -307,20 +287,50 @@ static int stage(struct run *r, int s)
     return rates(r, r->t + NODE[s] * r->h, into, &r->k[s]);
 }
 
+static inline double larger(double a, double b)
+{
+    a = fabs(a), b = fabs(b);
+    return a > b ? a : b;
+}
+
+static inline double over_of(const struct run *r, long i)
+{
+    const struct options *o = r->options;
+    double e = ERROR[0] * r->k[0].f[i];
+    for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].f[i];
+    return fabs(r->h * e) / (o->atol + o->rtol * larger(r->now.x[i], r->next.x[i]));
+}
+
+/* Largest error of a step, in states [from, to), over its tolerance; no number where one is none. */
+static double error_in(const struct run *r, long from, long to)
+{
+    double most[BLOCK] = {0}, sum[BLOCK] = {0}, worst = 0.0, all = 0.0;
+    long i = from;
+    for (; i + BLOCK <= to; i += BLOCK)
+        for (int l = 0; l < BLOCK; l++) {
+            double over = over_of(r, i + l);
+            most[l] = over > most[l] ? over : most[l];
+            sum[l] += over;
+        }
+    for (; i < to; i++) sum[i % BLOCK] += over_of(r, i), most[i % BLOCK] = larger(most[i % BLOCK], over_of(r, i));
+    for (int l = 0; l < BLOCK; l++) worst = larger(worst, most[l]), all += sum[l];
+    return isfinite(all) ? worst : NAN;
+}
+
 /* Largest error of a step over its tolerance. */
 static double error_of(struct run *r)
 {
     const struct options *o = r->options;
+    const struct fleet *f = r->fleet;
     double worst = 0.0;
-    for (long i = 0; i < r->n; i++) {
-        double e = ERROR[0] * r->k[0].f[i];
-        for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].f[i];
-        double weight = o->atol + o->rtol * fmax(fabs(r->now.x[i]), fabs(r->next.x[i]));
-        double over = fabs(r->h * e) / weight;
-        if (!(over <= worst)) worst = over; /* NaN too */
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        long from = group->first_state, to = from + group->packs * group->nx * f->lanes;
+        double over = error_in(r, from, to) / group->tolerance;
+        if (!(over <= worst)) worst = over;
+        if (isnan(worst)) return INFINITY;
     }
     if (!r->d || !isfinite(worst)) return worst;
-    const struct fleet *f = r->fleet;
     for (int pass = 0; pass < 2; pass++) {
         if (!pass)
             for (long k = 0; k < r->d; k++) r->scale[k] = 0.0;
@@ -344,6 +354,30 @@ static double error_of(struct run *r)
         }
     }
     return worst;
+}
+
+/* Largest rate at which a unit moves back to where it is drawn, from the last two stages of a step: both are at its
+ * end, so that their states differ by what the fastest motion makes of them. */
+static double fastest(const struct run *r)
+{
+    const struct fleet *f = r->fleet;
+    double most = 0.0;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        for (long pack = 0; pack < group->packs; pack++) {
+            double rate[BLOCK] = {0}, state[BLOCK] = {0};
+            long at = group->first_state + pack * group->nx * f->lanes;
+            for (long i = 0; i < group->nx; i++, at += f->lanes)
+                for (long l = 0; l < f->lanes; l++) {
+                    double df = r->k[STAGES - 1].f[at + l] - r->k[STAGES - 2].f[at + l];
+                    double dx = r->next.x[at + l] - r->stage.x[at + l];
+                    rate[l] += df * df, state[l] += dx * dx;
+                }
+            for (long l = 0; l < f->lanes; l++)
+                if (state[l] > 1e-24 && rate[l] > most * state[l]) most = rate[l] / state[l];
+        }
+    }
+    return sqrt(most);
 }
 
 static void dense_of(const struct run *r, long n, const double *x, const double *x1, double *const *k, double *c)
@@ -621,7 +655,10 @@ static double next_timer(const struct run *r)
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
         long count = group->packs * group->rows * f->lanes;
-        for (long k = 0; k < count; k++) next = fmin(next, group->since[k] + group->held[k]);
+        for (long k = 0; k < count; k++) {
+            double due = group->since[k] + group->held[k];
+            if (due < next) next = due;
+        }
     }
     return next;
 }
@@ -726,6 +763,7 @@ static int stretch_run(struct run *r, const struct stretch *s)
         double grow = 0.9 * pow(fmax(error, 1e-8), -0.14) * pow(r->error_before, 0.08);
         r->error_before = fmax(error, 1e-4);
         double next_h = (cut ? fmax(free_step, r->h) : r->h) * fmin(5.0, fmax(0.2, grow));
+        next_h = fmin(next_h, REACH / fastest(r));
         dense_step(r);
         double end = 1.0;
         int event = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]) > 0.0;
