@@ -131,7 +131,7 @@ class Group:
                 break
             last = level
             try:
-                move = self._inverse(j) @ r[:, :, None]
+                move = self._solve(j, r[:, :, None])
             except np.linalg.LinAlgError:  # singular: told below, by the residuals that are left
                 break
             x -= move[:, :nx, 0]
@@ -141,16 +141,16 @@ class Group:
         if s.setpoints:
             self._check_limits(guards[:, :, 0], moves[:, :, 0], where)
         return Equilibrium(
-            self, x, p, self._inverse(j), by_v, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
+            self, x, p, j, by_v, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
             float(level.max(initial=0.0)),
         )  # fmt: skip
 
-    def _inverse(self, jacobian: Floats) -> Floats:
-        """Inverse Jacobians. A unit without set-points may rest anywhere along some direction, as a battery
-        does at any charge: it stays where it starts."""
+    def _solve(self, jacobian: Floats, right: Floats) -> Floats:
+        """Change of the unknowns. A unit without set-points may rest anywhere along some direction, as a
+        battery does at any charge: it stays where it starts."""
         if self.structure.setpoints:
-            return np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
-        return np.asarray(np.linalg.pinv(jacobian, rcond=1e-11), dtype=np.float64)
+            return np.linalg.solve(jacobian, right)
+        return np.asarray(np.linalg.pinv(jacobian, rcond=1e-11) @ right, dtype=np.float64)
 
     def _check(self, residual: Floats, where: str) -> None:
         worst = np.nan_to_num(np.abs(residual), nan=np.inf).max(axis=1, initial=0.0)
@@ -207,8 +207,8 @@ class Equilibrium:
     group : Group
     x : array (units, states)
     p : array (units, parameters)
-    inverse : array (units, n, n)
-        Of the Jacobian of the residuals by states and set-points.
+    jacobian : array (units, n, n)
+        Of the residuals by states and set-points.
     by_v : array (units, n, 2)
         Jacobian of the residuals by the terminal voltage.
     current : complex array (units,)
@@ -222,7 +222,7 @@ class Equilibrium:
     group: Group
     x: Floats
     p: Floats
-    inverse: Floats
+    jacobian: Floats
     by_v: Floats
     current: Phasors
     slopes: Floats
@@ -240,7 +240,7 @@ class Equilibrium:
         right = self.by_v @ np.stack([dv.real, dv.imag], axis=1)
         if self.group.structure.setpoints:
             right[:, nx:] -= np.stack([di.real, di.imag], axis=1)
-        moved = -self.inverse @ right
+        moved = -self.group._solve(self.jacobian, right)
         return moved[:, :nx], moved[:, nx:]
 
     def current_by_v(self, dv: Phasors) -> Phasors:
