@@ -137,11 +137,11 @@ class Group:
             x -= move[:, :nx, 0]
             p[:, columns] -= move[:, nx:, 0]
         self._check(r, where)
-        by_v, guards, moves, now, slopes = for_units(s.at_rest, x, volts, p, current)
+        by_given, guards, moves, now, slopes = for_units(s.at_rest, x, volts, p, current)
         if s.setpoints:
             self._check_limits(guards[:, :, 0], moves[:, :, 0], where)
         return Equilibrium(
-            self, x, p, j, by_v, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
+            self, x, p, j, by_given, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
             float(level.max(initial=0.0)),
         )  # fmt: skip
 
@@ -209,12 +209,12 @@ class Equilibrium:
     p : array (units, parameters)
     jacobian : array (units, n, n)
         Of the residuals by states and set-points.
-    by_v : array (units, n, 2)
-        Jacobian of the residuals by the terminal voltage.
+    by_given : array (units, n, 2 + varied)
+        Jacobian of the residuals by the terminal voltage and the parameters that are varied.
     current : complex array (units,)
         Into the network.
-    slopes : array (units, 2, n + 2)
-        Of the current by states and set-points, then by the voltage.
+    slopes : array (units, 2, n + 2 + varied)
+        Of the current by states and set-points, then by the voltage and the parameters that are varied.
     residual : float
         Largest residual left.
     """
@@ -223,13 +223,19 @@ class Equilibrium:
     x: Floats
     p: Floats
     jacobian: Floats
-    by_v: Floats
+    by_given: Floats
     current: Phasors
     slopes: Floats
     residual: float
 
-    def derivatives(self, dv: Phasors, di: Phasors) -> tuple[Floats, Floats]:
+    def derivatives(self, dv: Phasors, di: Phasors, dvaried: Floats | None = None) -> tuple[Floats, Floats]:
         """Derivatives of states and set-points, for those of terminal voltages and currents (units, thetas).
+
+        Parameters
+        ----------
+        dv, di : complex arrays (units, thetas)
+        dvaried : array (units, varied, thetas), optional
+            Derivatives of the parameters that are varied; they stand still when not given.
 
         Returns
         -------
@@ -237,15 +243,20 @@ class Equilibrium:
         dsetpoints : array (units, set-points, thetas)
         """
         nx = self.x.shape[1]
-        right = self.by_v @ np.stack([dv.real, dv.imag], axis=1)
+        right = self.by_given @ self._given(dv, dvaried)
         if self.group.structure.setpoints:
             right[:, nx:] -= np.stack([di.real, di.imag], axis=1)
         moved = -self.group._solve(self.jacobian, right)
         return moved[:, :nx], moved[:, nx:]
 
-    def current_by_v(self, dv: Phasors) -> Phasors:
-        """Derivative of the current at rest, for those of terminal voltages (units, thetas)."""
-        moved, _ = self.derivatives(dv, np.zeros_like(dv))
-        volts = np.stack([dv.real, dv.imag], axis=1)
-        parts = self.slopes @ np.concatenate([moved, volts], axis=1)
+    def current_derivative(self, dv: Phasors, dvaried: Floats) -> Phasors:
+        """Derivative of the current at rest (units, thetas); arguments as those of `derivatives`."""
+        moved, _ = self.derivatives(dv, np.zeros_like(dv), dvaried)
+        parts = self.slopes @ np.concatenate([moved, self._given(dv, dvaried)], axis=1)
         return parts[:, 0] + 1j * parts[:, 1]
+
+    def _given(self, dv: Phasors, dvaried: Floats | None) -> Floats:
+        still = np.zeros((len(dv), len(self.group.structure.varied), dv.shape[1]))
+        return np.concatenate(
+            [dv.real[:, None], dv.imag[:, None], still if dvaried is None else dvaried], axis=1
+        )

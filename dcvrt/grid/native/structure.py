@@ -65,8 +65,8 @@ class Structure:
         1 where the output flows into the network, -1 where it flows into the unit.
     setpoints : sequence of str
         Parameters that follow from the operating point, as many as the terminal's current has parts.
-    sized : bool
-        Whether the size of the unit, `SCALE`, is a quantity to differentiate by.
+    varied : sequence of str
+        Parameters to differentiate by beside the set-points; `SCALE` is the size of the unit.
     angle, inertia, reactance : str
         Of a rotor: the state that is its angle, the parameter that weighs it, and that behind which the
         q-axis lies; empty where there is none.
@@ -77,7 +77,7 @@ class Structure:
     current: str = "i"
     sign: float = 1.0
     setpoints: Sequence[str] = ()
-    sized: bool = False
+    varied: Sequence[str] = ()
     angle: str = ""
     inertia: str = ""
     reactance: str = ""
@@ -173,7 +173,7 @@ class Structure:
     @property
     def moving(self) -> tuple[str, ...]:
         """Parameters that change with the operating point: derivatives pass through them."""
-        return (*self.setpoints, *((SCALE,) if self.sized else ()))
+        return (*self.setpoints, *self.varied)
 
     def column(self, path: str) -> int:
         """Position among `p` of a parameter, or of `SCALE`."""
@@ -240,22 +240,27 @@ class Structure:
         return ca.Function("balance", given, self._at_start(made), {"cse": True})
 
     @cached_property
+    def given(self) -> ca.SX:
+        """What an equilibrium moves with: the terminal voltage, then the parameters that are varied."""
+        return ca.vertcat(self.v, *(self.p[self.column(path)] for path in self.varied))
+
+    @cached_property
     def at_rest(self) -> ca.Function:
-        """(x, v, p, current wanted) -> Jacobian of the residual by v, guards, how far each row would move its
-        states, current, its Jacobian by unknowns and v."""
+        """(x, v, p, current wanted) -> Jacobian of the residual by what is given, guards, how far each row
+        would move its states, current, its Jacobian by what is unknown and given."""
         moves = [
             sum((ca.fabs(value - self.dae.x[state]) for state, value in row.reset.items()), ca.SX(0))
             for _, row in self.rows
         ]
         made = [
-            ca.densify(ca.jacobian(self._residual, self.v)),
+            ca.densify(ca.jacobian(self._residual, self.given)),
             ca.densify(self.guards),
             ca.densify(ca.vertcat(ca.SX(0, 1), *moves)),
             self.i,
-            ca.densify(ca.jacobian(self.i, ca.vertcat(self.unknown, self.v))),
+            ca.densify(ca.jacobian(self.i, ca.vertcat(self.unknown, self.given))),
         ]
-        given = [self.dae.x, self.v, self.p, self._wanted]
-        return ca.Function("at_rest", given, self._at_start(made), {"cse": True})
+        at = [self.dae.x, self.v, self.p, self._wanted]
+        return ca.Function("at_rest", at, self._at_start(made), {"cse": True})
 
     @cached_property
     def start(self) -> ca.Function:
