@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, raise_all
+from dcvrt.errors import InputError, did_you_mean, raise_all
 from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
@@ -235,7 +235,15 @@ class Engine:
         for buses in alike.values():
             facility = facilities[buses[0]]
             structure = self._structure_of(facility)
-            known = {path: value for path, value in given.items() if path in structure.dae.p_names}
+            names = structure.dae.p_names
+            wanted = [*values, *(RATING for quantity in wrt if quantity.kind == RATING)]
+            for path in wanted:
+                if path not in names:
+                    raise InputError(
+                        f"{self.network.name}: facility {facility.name} at bus {buses[0]} has no parameter "
+                        f"{path!r}.{did_you_mean(path, names)}"
+                    )
+            known = {path: value for path, value in given.items() if path in names}
             try:
                 structure.dae.parameter_values(**known)
             except InputError as error:

@@ -149,7 +149,7 @@ class Group:
         """Change of the unknowns. A unit without set-points may rest anywhere along some direction, as a
         battery does at any charge: it stays where it starts."""
         if self.structure.setpoints:
-            return np.linalg.solve(jacobian, right)
+            return np.asarray(np.linalg.solve(jacobian, right), dtype=np.float64)
         return np.asarray(np.linalg.pinv(jacobian, rcond=1e-11) @ right, dtype=np.float64)
 
     def _check(self, residual: Floats, where: str) -> None:

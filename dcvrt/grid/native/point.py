@@ -169,7 +169,7 @@ class NativePoint:
             drawn = np.concatenate([*(-v[g] * f.current.conj() for g, f in self._at(fed, at)), np.zeros(0)])
             total = load.copy()
             np.add.at(total, at, drawn)
-            if len(at) and np.abs(drawn - before).max() < AGREED:
+            if steady is not None and np.abs(drawn - before).max() < AGREED:
                 return fed
             self.steady = steady = system.flow.solve(total, rule, reactive_limits, self.where, steady)
             v = steady.v

@@ -66,7 +66,7 @@ class Steady:
 
     @cached_property
     def _factors(self) -> spla.SuperLU:
-        current = self._equations.y @ self.v
+        current = np.asarray(self._equations.y @ self.v, dtype=np.complex128)
         return spla.splu(self._equations.jacobian(self.v, current, self._share))
 
     def derivatives(self, load: Phasors) -> tuple[Phasors, Phasors]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -35,11 +36,12 @@ def for_units(function: ca.Function, *values: Floats) -> list[Floats]:
     given = [np.ascontiguousarray(v, dtype=np.float64) for v in values]
     found = [np.empty((n, columns, rows)) for rows, columns in shapes]
     # numbers pass through memory: matrices of CasADi are made of them one by one
+    buffer: Any  # its stubs take memory of integers
     buffer, run = function.map(n).buffer()
     for k, array in enumerate(given):
-        buffer.set_arg(k, memoryview(array.ravel()))
+        buffer.set_arg(k, array.reshape(-1).data)
     for k, array in enumerate(found):
-        buffer.set_res(k, memoryview(array.ravel()))
+        buffer.set_res(k, array.reshape(-1).data)
     run()
     return [array.transpose(0, 2, 1) for array in found]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dcvrt.grid import BusFault, Grid, Period, andes
-from dcvrt.grid.grid import FaultRun
+from dcvrt.grid.fault_run import FaultRun
 from dcvrt.grid.native.steady import Flow, loads
 from dcvrt.grid.network import Network
 from tests.grid.native.cases import NO_VRT, TIGHT, TIGHTEST, WINDY, away, case, package, run

@@ -125,6 +125,30 @@ def test_tangents_in_closed_loop_across_modes_and_timers(name: str, x_q2: float)
     assert max(worst.values()) < 1e-6, worst
 
 
+@pytest.mark.parametrize(("name", "beta"), [("gfl", 1.3), ("gfl", 1.03), ("gfm", 1.3)])
+def test_tangents_by_the_rating(name: str, beta: float) -> None:
+    """At 1.03 the limiter stands at the edge of acting before the fault."""
+    of, diagram = small(0.25 if name == "gfl" else 0.33), facility.get(name)
+    times = even(FAULT, of, 0.9, 12)
+    of_rating = {"values": {"beta": beta}}
+    names = ("beta", "H_3")
+    worst = compare(
+        of, {3: 20.0}, Period(), FAULT, names, times, None, 0.1, facilities={3: diagram}, **of_rating
+    )
+    assert max(worst.values()) < 1e-6, worst
+
+
+def test_tangent_of_the_first_megawatt() -> None:
+    of, diagram = small(), facility.gfl()
+    times, names = even(FAULT, of, 0.6, 8), ("H_3",)
+    given = dict(times=times, facilities={3: diagram}, options=TIGHTEST)
+    _, none, _ = run(of, {3: 0.0}, FAULT, wrt=names, **given)
+    _, some, _ = run(of, {3: 1e-2}, FAULT, wrt=names, **given)
+    difference = (some.v - none.v) / 1e-2
+    middle = 0.5 * (none.tangents[:, 0] + some.tangents[:, 0])  # exact to the square of the step
+    assert np.abs(difference - middle).max() < 1e-5 * np.abs(middle).max()
+
+
 def test_derivatives_asked_for_do_not_change_the_run() -> None:
     of, diagram = small(), facility.gfm()
     _, plain, _ = run(of, {3: 20.0}, FAULT, 0.9, facilities={3: diagram}, options=TIGHT)
