@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from dcvrt.criteria import Criteria
-from dcvrt.grid.grid import Grid
+from dcvrt.errors import InfeasibleError, SimulationError
+from dcvrt.grid.faults import BusFault
+from dcvrt.grid.grid import STEP, Grid
 from dcvrt.grid.period import Period
 from dcvrt.integrators.simulator import Simulator
 from dcvrt.models import Diagram
+from dcvrt.planning import replay
 from dcvrt.waveform import Waveform
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from dcvrt.grid.fault_run import FaultRun
     from dcvrt.grid.faults import Fault
+
+LOOPS = ("open", "closed")
 
 
 def compare(
@@ -28,6 +32,7 @@ def compare(
     period: Period | None = None,
     criteria: Criteria | None = None,
     until: float = 2.5,
+    step: float = STEP,
 ) -> pd.DataFrame:
     """Margins of every open site under every fault, open and closed loop.
 
@@ -46,8 +51,8 @@ def compare(
     period : Period, optional
         Reference load when not given.
     criteria : Criteria, optional
-    until : float
-        End, s.
+    until, step : float
+        End and sample distance, s.
 
     Returns
     -------
@@ -58,54 +63,139 @@ def compare(
 
     Raises
     ------
-    InputError, SimulationError, InfeasibleError
-        As `Grid.waveforms_of`. A fault that does not reach its end has a row with its status and no margins.
+    InputError
+        As `Grid.waveforms_of`. A loop without an operating point, or a fault that does not reach its end, has
+        rows with the status and no margins.
     """
     import pandas as pd
 
-    period, criteria = period or Period(), criteria or Criteria()
-    compiled = facility.compile()
+    period = period or Period()
+    simulator = Simulator(facility.compile())
+    given = (hosting, period, faults, until, step)
+    runs = {loop: _runs(grid, given, simulator if loop == "closed" else None, {}) for loop in LOOPS}
+    values = {"pf": grid.pf} if "pf" in simulator.dae.p_names else {}
     sites = [bus for bus, mw in hosting.items() if mw > 0]
-    coupled = dict.fromkeys(sites, compiled)
-    loops = {
-        "open": grid.waveforms_of(hosting, period, faults, until),
-        "closed": grid.waveforms_of(hosting, period, faults, until, facilities=coupled),
+    labels = {fault: fault.label for fault in faults}
+    at = {"H": 1.0, "d": period.dc_factor, **values}
+    return pd.DataFrame(_rows(labels, sites, runs, simulator, at, criteria or Criteria()))
+
+
+def compare_plan(request: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The same for a plan in one period, at several modes and ratings, by the native engine.
+
+    Parameters
+    ----------
+    request : mapping of plain data
+        As that of `dcvrt.planning.replay.check_hosting`; `engine` and `gradients` are not looked at.
+
+    Returns
+    -------
+    list of dict
+        The rows of `compare`, each with `period`, `mode` and `beta`.
+    """
+    given = dict(request["period"])
+    period = Period(wind={int(bus): mw for bus, mw in given.pop("wind").items()}, **given)
+    hosting = {
+        int(bus): float(mw) for bus, mw in zip(request["sites"], request["hosting"], strict=True) if mw > 0
     }
-    simulator = Simulator(compiled)
-    pf = {"pf": grid.pf} if "pf" in compiled.p_names else {}
+    grid, labels = replay._grid_of(request), _labels(request)
+    asked = (hosting, period, list(labels), float(request["t_end_s"]), float(request["step_s"]))
+    open_loop = _runs(grid, asked, None, {})
+    found = []
+    for mode, beta in request["runs"]:
+        simulator = replay.simulator_of(mode, request["parameters"].get(mode, {}))
+        runs = {"open": open_loop, "closed": _runs(grid, asked, simulator, {"beta": float(beta)})}
+        at = {"H": 1.0, "d": period.dc_factor, "pf": float(request["pf"]), "beta": float(beta)}
+        rows = _rows(labels, list(hosting), runs, simulator, at, Criteria(**request["criteria"]))
+        found += [{"period": period.name, "mode": mode, "beta": float(beta), **row} for row in rows]
+    return found
+
+
+def lost_rows(request: Mapping[str, Any], status: str) -> list[dict[str, Any]]:
+    """Rows of `compare_plan` that stand for a comparison that was not made."""
+    return [
+        {"period": request["period"]["name"], "mode": mode, "beta": float(beta), "fault": fault}
+        | {"site": int(site), "status": status, "same_sequence": False}
+        for mode, beta in request["runs"]
+        for fault in _labels(request).values()
+        for site, mw in zip(request["sites"], request["hosting"], strict=True)
+        if mw > 0
+    ]
+
+
+def _labels(request: Mapping[str, Any]) -> dict[Fault, str]:
+    return {
+        BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): (
+            replay.fault_label(f)
+        )
+        for f in request["faults"]
+    }
+
+
+Asked = tuple[Mapping[int, float], Period, Sequence["Fault"], float, float]
+
+
+def _runs(
+    grid: Grid, asked: Asked, facility: Simulator | None, values: Mapping[str, float]
+) -> Mapping[Fault, FaultRun] | str:
+    """Runs of all faults, with a facility at every site that hosts anything or with none; or why there is
+    none."""
+    hosting, period, faults, until, step = asked
+    sites = [bus for bus, mw in hosting.items() if mw > 0]
+    coupled = None if facility is None else dict.fromkeys(sites, facility.dae)
+    try:
+        return grid.waveforms_of(
+            hosting, period, faults, until, step=step, facilities=coupled, values=values if coupled else None
+        )
+    except (SimulationError, InfeasibleError) as error:
+        return str(error)
+
+
+def _rows(
+    labels: Mapping[Fault, str],
+    sites: Sequence[int],
+    runs: Mapping[str, Mapping[Fault, FaultRun] | str],
+    simulator: Simulator,
+    values: Mapping[str, float],
+    criteria: Criteria,
+) -> list[dict[str, Any]]:
+    """One row a fault and site."""
     rows = []
-    for fault in dict.fromkeys(faults):
-        runs = {loop: found[fault] for loop, found in loops.items()}
-        failed = [run.status for run in runs.values() if not run.completed]
+    for fault, label in labels.items():
+        by_loop = {loop: found if isinstance(found, str) else found[fault] for loop, found in runs.items()}
+        failed = [
+            found if isinstance(found, str) else found.status
+            for found in by_loop.values()
+            if isinstance(found, str) or not found.completed
+        ]
         for site in sites:
-            row: dict[str, object] = {"fault": fault.label, "site": site, "status": "; ".join(failed)}
+            row: dict[str, Any] = {"fault": label, "site": site, "status": "; ".join(failed)}
             sequences = []
-            for loop, run in runs.items():
-                if failed:
+            for loop, found in by_loop.items():
+                if isinstance(found, str) or failed:
                     continue
-                margins, status = _margins(simulator, run[site], criteria, {"d": period.dc_factor, **pf})
+                margins, status = _margins(simulator, found[site], criteria, values)
                 row["status"] = row["status"] or status
                 row |= {f"{name}_{loop}": value for name, value in margins.items() if name != "sequence"}
                 sequences.append(margins.get("sequence"))
             row["same_sequence"] = len(sequences) == 2 and sequences[0] == sequences[1]
             rows.append(row)
-    return pd.DataFrame(rows)
+    return rows
 
 
 def _margins(
-    simulator: Simulator, waveform: Waveform, criteria: Criteria, parameters: Mapping[str, float]
-) -> tuple[dict[str, object], str]:
+    simulator: Simulator, waveform: Waveform, criteria: Criteria, values: Mapping[str, float]
+) -> tuple[dict[str, Any], str]:
     """Margins of one run, and why there are none."""
-    result = simulator.batch([waveform], {"H": 1.0, **parameters}, criteria=criteria)
+    result = simulator.batch([waveform], values, criteria=criteria)
     found = result.margins[0]
-    lowest = float(np.abs(waveform.v).min())
+    lowest, _ = replay.lowest_voltage(waveform)
     if found is None:
         return {"v_poi_min": lowest}, result.status[0]
-    passed = found.voltage.value >= 0 and found.loss.value >= 0
     return {
         "v_poi_min": lowest,
         "voltage": found.voltage.value,
         "loss": found.loss.value,
-        "passed": passed,
-        "sequence": tuple(entry.split(" [")[0] for entry in found.sequence),
+        "passed": found.voltage.value >= 0 and found.loss.value >= 0,
+        "sequence": tuple(replay.modes_passed(found.sequence)),
     }, ""
