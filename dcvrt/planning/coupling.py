@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.criteria import Criteria
+from dcvrt.criteria import Criteria, Margins
 from dcvrt.errors import InfeasibleError, SimulationError
 from dcvrt.grid.faults import BusFault
 from dcvrt.grid.grid import STEP, Grid
@@ -59,13 +60,13 @@ def compare(
     DataFrame
         One row a fault and site: `fault`, `site`, and for each loop `v_poi_min` (pu), `voltage` (margin, pu),
         `loss` (margin, share of load), `passed`, with endings `_open` and `_closed`; `same_sequence`, whether
-        the modes followed one another alike; `status`, empty where both loops have margins.
+        the modes followed one another alike; `status`, empty where both loops have margins. Where a loop has
+        no operating point, a fault does not reach its end or a facility fails, it has no margins.
 
     Raises
     ------
     InputError
-        As `Grid.waveforms_of`. A loop without an operating point, or a fault that does not reach its end, has
-        rows with the status and no margins.
+        As `Grid.waveforms_of`.
     """
     import pandas as pd
 
@@ -160,42 +161,37 @@ def _rows(
     criteria: Criteria,
 ) -> list[dict[str, Any]]:
     """One row a fault and site."""
+    waveforms: dict[tuple[str, Fault, int], Waveform] = {}
+    why: dict[tuple[str, Fault, int], str] = {}
+    for loop, fault, site in itertools.product(LOOPS, labels, sites):
+        found = runs[loop]
+        if isinstance(found, str):
+            why[loop, fault, site] = found
+        elif found[fault].completed:
+            waveforms[loop, fault, site] = found[fault][site]
+        else:
+            why[loop, fault, site] = found[fault].status
+    margins: dict[tuple[str, Fault, int], Margins] = {}
+    if waveforms:
+        result = simulator.batch(list(waveforms.values()), values, criteria=criteria)
+        for case, status, of_case in zip(waveforms, result.status, result.margins, strict=True):
+            if of_case is None:
+                why[case] = status
+            else:
+                margins[case] = of_case
     rows = []
-    for fault, label in labels.items():
-        by_loop = {loop: found if isinstance(found, str) else found[fault] for loop, found in runs.items()}
-        failed = [
-            found if isinstance(found, str) else found.status
-            for found in by_loop.values()
-            if isinstance(found, str) or not found.completed
-        ]
-        for site in sites:
-            row: dict[str, Any] = {"fault": label, "site": site, "status": "; ".join(failed)}
-            sequences = []
-            for loop, found in by_loop.items():
-                if isinstance(found, str) or failed:
-                    continue
-                margins, status = _margins(simulator, found[site], criteria, values)
-                row["status"] = row["status"] or status
-                row |= {f"{name}_{loop}": value for name, value in margins.items() if name != "sequence"}
-                sequences.append(margins.get("sequence"))
-            row["same_sequence"] = len(sequences) == 2 and sequences[0] == sequences[1]
-            rows.append(row)
+    for fault, site in itertools.product(labels, sites):
+        cases = {loop: (loop, fault, site) for loop in LOOPS}
+        row: dict[str, Any] = {"fault": labels[fault], "site": site}
+        row["status"] = "; ".join(dict.fromkeys(why[case] for case in cases.values() if case in why))
+        for loop, case in cases.items():
+            if case in waveforms:
+                row[f"v_poi_min_{loop}"], _ = replay.lowest_voltage(waveforms[case])
+            if case in margins:
+                voltage, loss = margins[case].voltage.value, margins[case].loss.value
+                row |= {f"voltage_{loop}": voltage, f"loss_{loop}": loss}
+                row[f"passed_{loop}"] = bool(voltage >= 0 and loss >= 0)
+        passed = [tuple(replay.modes_passed(margins[c].sequence)) for c in cases.values() if c in margins]
+        row["same_sequence"] = len(passed) == 2 and passed[0] == passed[1]
+        rows.append(row)
     return rows
-
-
-def _margins(
-    simulator: Simulator, waveform: Waveform, criteria: Criteria, values: Mapping[str, float]
-) -> tuple[dict[str, Any], str]:
-    """Margins of one run, and why there are none."""
-    result = simulator.batch([waveform], values, criteria=criteria)
-    found = result.margins[0]
-    lowest, _ = replay.lowest_voltage(waveform)
-    if found is None:
-        return {"v_poi_min": lowest}, result.status[0]
-    return {
-        "v_poi_min": lowest,
-        "voltage": found.voltage.value,
-        "loss": found.loss.value,
-        "passed": found.voltage.value >= 0 and found.loss.value >= 0,
-        "sequence": tuple(replay.modes_passed(found.sequence)),
-    }, ""
