@@ -1,5 +1,5 @@
 """What a study folder holds for people and programs, made from the store alone: summary.json, table.csv,
-validation.csv, frontier.json.
+validation.csv, coupling.csv, frontier.json.
 
 Each file is written beside itself and then moved into place: a file that is there is whole.
 """
@@ -23,7 +23,7 @@ from dcvrt.studies.system_limit import system_limits
 if TYPE_CHECKING:
     import pandas as pd
 
-FRONTIER = "frontier.json"
+FRONTIER, COUPLING = "frontier.json", "coupling.csv"
 SYSTEM_KEYS = (
     "mode", "beta", "limit", "limit_mw", "limit_share", "total_mw", "by_site", "passed", "ac_passed",
     "aggregate_loss_mw", "lost_whole", "price_mw_per_mw",
@@ -76,6 +76,7 @@ def write_results(folder: Path, store: Store) -> list[Path]:
     return [
         write_atomically(folder / TABLE, plan_table(store).to_csv(index=False)),
         write_atomically(folder / VALIDATION, validation_table(store).to_csv(index=False)),
+        write_atomically(folder / COUPLING, store.coupling().to_csv(index=False)),
         write_atomically(
             folder / FRONTIER,
             json.dumps(

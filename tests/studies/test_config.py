@@ -289,6 +289,16 @@ def test_fields_that_contradict_each_other() -> None:
     ]
 
 
+def test_closed_loop_with_an_engine_that_has_no_facilities() -> None:
+    text = changed(
+        ('engine = "native"  ', 'engine = "andes"  '), ('coupling = "open"  ', 'coupling = "closed"  ')
+    )
+    assert complaint(text).splitlines()[1] == (
+        "  grid.coupling = 'closed': grid.engine = 'andes' has no model of a facility. Way out: "
+        "grid.engine = 'native', or coupling = 'open'."
+    )
+
+
 def test_derivatives_of_an_engine_that_has_none() -> None:
     text = changed(('engine = "native"  ', 'engine = "andes"  '), ("gradients = false", "gradients = true"))
     assert complaint(text).splitlines()[1:] == [
