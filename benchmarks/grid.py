@@ -35,6 +35,7 @@ HOSTING = {21: 31.4, 75: 153.9, 106: 102.4, 108: 104.1}
 FAULTS = (22, 23, 17, 74, 100, 103, 105, 109, 30, 78, 92, 65)
 OTHERS = {
     "kundur_full": ("kundur/kundur_full.xlsx", 7, 8),
+    "ieee14": ("ieee14/ieee14.raw", 9, 4),
     "ieee39_full": ("ieee39/ieee39_full.xlsx", 20, 16),
 }
 """Case: file in the package of ANDES, bus that is looked at, bus of the fault."""

@@ -44,6 +44,7 @@ class _Found(NamedTuple):
     v: Phasors
     tangents: Mapping[str, Phasors]
     status: str
+    notes: Sequence[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +245,10 @@ class Grid:
                 )
                 for k, bus in reached
             }
-            runs[found.fault] = FaultRun(found.fault, waveforms, f"{name}: {found.status or 'completed.'}")
+            ended = found.status or "completed."
+            if found.notes:
+                ended += f" Counts as on its limit at the start: {'; '.join(found.notes)}."
+            runs[found.fault] = FaultRun(found.fault, waveforms, f"{name}: {ended}")
         return runs
 
     def _by_andes(self, asked: Request) -> Iterator[_Found]:
@@ -253,7 +257,7 @@ class Grid:
         for fault in bolted:
             times = sample_times(fault.stages(self.network), asked.until, asked.step)
             v, status = point.simulate(fault, times, self.sites)
-            yield _Found(fault, np.concatenate(times), v, {}, status)
+            yield _Found(fault, np.concatenate(times), v, {}, status, point.notes)
 
     def _by_own_engine(self, asked: Request) -> Iterator[_Found]:
         by = thetas(asked.wrt, self.sites, self.network)
@@ -263,10 +267,10 @@ class Grid:
             try:
                 run = self.native.simulate(point, fault, times, by)
             except SimulationError as error:  # islands: this fault has no result, the others may have
-                yield _Found(fault, np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error))
+                yield _Found(fault, np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error), ())
                 continue
             tangents = {q.name: run.tangents[:, k] for k, q in enumerate(by)}
-            yield _Found(fault, np.concatenate(times), run.v, tangents, run.status)
+            yield _Found(fault, np.concatenate(times), run.v, tangents, run.status, point.notes)
 
     @cached_property
     def native(self) -> Engine:

@@ -23,7 +23,8 @@ STEPS = 40
 AT_REST = 1e-8
 """Guard, of rates at rest, that counts as zero."""
 ON_LIMIT = 1e-4
-"""Distance beyond a limit, pu, at which a unit may start: data in four digits leave so much."""
+"""Distance beyond a limit, pu, at which a unit may start and counts as on it: data in four digits leave so
+much. Both engines tell of it."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,10 @@ class Group:
             p[:, columns] -= move[:, nx:, 0]
         self._check(r, where)
         by_given, guards, moves, now, slopes = for_units(s.at_rest, x, volts, p, current)
-        if s.setpoints:
-            self._check_limits(guards[:, :, 0], moves[:, :, 0], where)
+        notes = self._check_limits(guards[:, :, 0], moves[:, :, 0], where) if s.setpoints else ()
         return Equilibrium(
             self, x, p, j, by_given, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
-            float(level.max(initial=0.0)),
+            float(level.max(initial=0.0)), notes,
         )  # fmt: skip
 
     def _solve(self, jacobian: Floats, right: Floats) -> Floats:
@@ -167,22 +167,24 @@ class Group:
             f"{self.units[k].bus}: {named}. Way out: host less, or check its data."
         )
 
-    def _check_limits(self, guards: Floats, moves: Floats, where: str) -> None:
-        """Refuse a start outside a limit.
+    def _check_limits(self, guards: Floats, moves: Floats, where: str) -> tuple[str, ...]:
+        """Refuse a start outside a limit; a sentence for each that counts as on it.
 
         At rest nothing pushes, so the guard of a limit that also asks for that is zero to rounding; how far
         the limit is exceeded is then how far its row would move the state.
         """
         rows, automata = self.structure.rows, self.structure.dae.automata
-        broken = []
+        broken, notes = [], []
         beyond = np.maximum(guards[:, : len(rows)], moves)
         for r, (a, row) in enumerate(rows):
             if row.source != automata[a].start:
                 continue
-            broken += [
-                f"{self.units[k].name} at bus {self.units[k].bus}: {automata[a].path}, {row.text}"
-                for k in np.flatnonzero((guards[:, r] > -AT_REST) & (beyond[:, r] > ON_LIMIT)).tolist()
-            ]
+            for k in np.flatnonzero((guards[:, r] > -AT_REST) & (beyond[:, r] > AT_REST)).tolist():
+                text = f"{self.units[k].name} at bus {self.units[k].bus}: {automata[a].path}, {row.text}"
+                if beyond[k, r] > ON_LIMIT:
+                    broken.append(text)
+                else:
+                    notes.append(f"{text} by {beyond[k, r]:.1g} pu")
         states = self.structure.dae.states
         for b, (state, _, bound) in enumerate(self.structure.bounds):
             broken += [
@@ -196,6 +198,7 @@ class Group:
                 f"{'; '.join(broken[:4])}{more}. "
                 "Way out: host less, or give the unit a wider limit."
             )
+        return tuple(notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +220,8 @@ class Equilibrium:
         Of the current by states and set-points, then by the voltage and the parameters that are varied.
     residual : float
         Largest residual left.
+    notes : tuple of str
+        Units that start beyond a limit by so little that they count as on it.
     """
 
     group: Group
@@ -227,6 +232,7 @@ class Equilibrium:
     current: Phasors
     slopes: Floats
     residual: float
+    notes: tuple[str, ...]
 
     def derivatives(self, dv: Phasors, di: Phasors, dvaried: Floats | None = None) -> tuple[Floats, Floats]:
         """Derivatives of states and set-points, for those of terminal voltages and currents (units, thetas).

@@ -226,6 +226,11 @@ class NativePoint:
         """Largest residual of the equilibrium."""
         return max((rest.residual for rest in self.rest), default=0.0)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Units that start beyond a limit by so little that they count as on it."""
+        return tuple(note for rest in self.rest for note in rest.notes)
+
     @cached_property
     def fleet(self) -> Fleet:
         """The units, ready to run."""
