@@ -10,8 +10,8 @@ import pytest
 
 from dcvrt import Simulator, Waveform, facility
 from dcvrt.grid import BusFault, Grid, Period
-from dcvrt.grid.native.engine import Engine
-from dcvrt.grid.native.run import Simulated
+from dcvrt.grid.native.engine import Engine, sample_times
+from dcvrt.grid.native.run import Options, Simulated
 from tests.grid.native.cases import NO_VRT, TIGHT, TIGHTEST, away, run
 from tests.grid.native.test_sensitivities import compare, even, same_events, with_limits
 
@@ -99,6 +99,23 @@ def test_two_facilities_of_one_diagram_and_of_two_are_the_same() -> None:
         of, hosting, FAULT, 0.6, facilities={1: facility.gfl(), 3: facility.gfl()}, options=TIGHTEST
     )
     assert np.abs(one.v - two.v).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", ["gfl", "gfm"])
+def test_the_default_tolerance_keeps_voltages_and_events(grid: Grid, name: str) -> None:
+    """Facilities are allowed three times the error of machines, and step at the edge of stability."""
+    coupled = dict.fromkeys(NO_VRT, facility.get(name).compile())
+    point = grid.native.point(NO_VRT, Period(), (), coupled, {"beta": 1.3})
+    for fault in (BusFault(22), BusFault(103)):
+        stages = fault.stages(grid.network)
+        times = sample_times(stages, 3.0, 1 / 120)
+        coarse, fine = (point.simulate(stages, times, o) for o in (Options(), TIGHT))
+        assert not coarse.status
+        assert len(coarse.events) >= 4
+        assert [e[1:] for e in coarse.events] == [e[1:] for e in fine.events]
+        shift = [a[0] - b[0] for a, b in zip(coarse.events, fine.events, strict=True)]
+        assert np.abs(shift).max() < 5e-6
+        assert np.abs(coarse.v - fine.v).max() < 1e-5
 
 
 def modes(found: Simulated, around: list[Simulated]) -> None:
