@@ -69,7 +69,7 @@ class Grid:
         Who supplies a change of load. `proportional`: all scheduled units in proportion to their schedule, up
         to their limits, losses included; `slack`: the unit at the slack bus.
     reactive_limits : bool
-        Whether the power flow keeps units within their reactive limits; the slack bus has none.
+        Whether the power flow keeps units within their reactive limits.
     load_model, wind_model : block of `dcvrt.models.machines`, optional
         What network loads and wind are in a fault, for the native engine: `ExponentialLoad`, `ZipLoad`,
         `CurrentConverter`. Impedances when not given.
@@ -113,7 +113,7 @@ class Grid:
         redispatch : str
             `proportional` or `slack`.
         reactive_limits : bool
-            Whether the power flow keeps units within their reactive limits; the slack bus has none.
+            Whether the power flow keeps units within their reactive limits.
         load_model, wind_model : block of `dcvrt.models.machines`, optional
             What network loads and wind are in a fault, for the native engine; impedances when not given.
 

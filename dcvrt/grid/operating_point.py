@@ -91,8 +91,9 @@ class OperatingPoint:
             reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
             system.PQ.p0.v[:loads] *= load_scale
             system.PQ.q0.v[:loads] *= load_scale
-            for k, bus in enumerate(system.PV.bus.v):
-                system.PV.v0.v[k] = (set_points or {}).get(bus, system.PV.v0.v[k])
+            for units in (system.PV, system.Slack):
+                for k, bus in enumerate(units.bus.v):
+                    units.v0.v[k] = (set_points or {}).get(bus, units.v0.v[k])
             self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
             self._initialise(said)
 
