@@ -137,7 +137,8 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    files = _files("fleet.h", "pair.h", "network.c")
+    headers = ("fleet.h", "pair.h", "run.h", "voltages.h", "steps.h", "events.h")
+    files = _files(*headers, "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
     dll.fleet_run.argtypes = [
