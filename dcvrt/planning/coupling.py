@@ -19,6 +19,7 @@ from dcvrt.waveform import Waveform
 if TYPE_CHECKING:
     import pandas as pd
 
+    from dcvrt.dae import Dae
     from dcvrt.grid.fault_run import FaultRun
     from dcvrt.grid.faults import Fault
 
@@ -81,6 +82,43 @@ def compare(
     return pd.DataFrame(_rows(labels, sites, runs, simulator, at, criteria or Criteria()))
 
 
+def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
+    """`dcvrt.planning.replay.check_hosting`, in closed loop where `coupling` of the request is 'closed'.
+
+    Then the facilities of each mode and rating are in the network, which has fault simulations of its own for
+    them, by the native engine; waveforms are not kept. Derivatives are total, by the rating too: it moves
+    the voltage. A facility that does not start, or leaves its bounds, ends a simulation for all sites.
+    """
+    if request["coupling"] == "open":
+        return replay.check_hosting(request)
+    period, hosting, labels = _asked_of(request)
+    sites = [int(bus) for bus in request["sites"]]
+    grid, wrt = replay._grid_of(request), replay.thetas(request)
+    all_sites = {bus: hosting.get(bus, 0.0) for bus in sites}
+    answer: dict[str, Any] = {"rows": [], "waveforms": [], "grid": 0, "facility": 0}
+    for mode, beta in request["runs"]:
+        one = {**request, "runs": [[mode, beta]]}
+        dae = replay.simulator_of(mode, request["parameters"].get(mode, {})).dae
+        coupled = dict.fromkeys(sites if wrt else hosting, dae)
+        asked = (all_sites, period, list(labels), float(request["t_end_s"]), float(request["step_s"]))
+        runs = _simulated(grid, asked, coupled, {"beta": float(beta)}, wrt)
+        answer["grid"] += len(labels)
+        found = {}
+        for fault, label in labels.items():
+            if isinstance(runs, str) or not runs[fault].completed:
+                status = runs if isinstance(runs, str) else runs[fault].status
+                answer["rows"] += replay.lost_rows(one, status, "grid", faults=[label])
+            else:
+                found[label] = runs[fault].waveforms
+        if found:
+            rows = replay._facility_rows(
+                one, period.name, mode, [float(beta)], found, all_sites, period.dc_factor
+            )
+            answer["rows"] += rows
+            answer["facility"] += len(rows)
+    return answer
+
+
 def compare_plan(request: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The same for a plan in one period, at several modes and ratings, by the native engine.
 
@@ -94,12 +132,8 @@ def compare_plan(request: Mapping[str, Any]) -> list[dict[str, Any]]:
     list of dict
         The rows of `compare`, each with `period`, `mode` and `beta`.
     """
-    given = dict(request["period"])
-    period = Period(wind={int(bus): mw for bus, mw in given.pop("wind").items()}, **given)
-    hosting = {
-        int(bus): float(mw) for bus, mw in zip(request["sites"], request["hosting"], strict=True) if mw > 0
-    }
-    grid, labels = replay._grid_of(request), _labels(request)
+    period, hosting, labels = _asked_of(request)
+    grid = replay._grid_of(request)
     asked = (hosting, period, list(labels), float(request["t_end_s"]), float(request["step_s"]))
     open_loop = _runs(grid, asked, None, {})
     found = []
@@ -124,6 +158,14 @@ def lost_rows(request: Mapping[str, Any], status: str) -> list[dict[str, Any]]:
     ]
 
 
+def _asked_of(request: Mapping[str, Any]) -> tuple[Period, dict[int, float], dict[Fault, str]]:
+    """Period, capacities of the sites that host anything, and faults with what tables call them."""
+    given = dict(request["period"])
+    period = Period(wind={int(bus): mw for bus, mw in given.pop("wind").items()}, **given)
+    sizes = zip(request["sites"], request["hosting"], strict=True)
+    return period, {int(bus): float(mw) for bus, mw in sizes if mw > 0}, _labels(request)
+
+
 def _labels(request: Mapping[str, Any]) -> dict[Fault, str]:
     return {
         BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): (
@@ -141,12 +183,24 @@ def _runs(
 ) -> Mapping[Fault, FaultRun] | str:
     """Runs of all faults, with a facility at every site that hosts anything or with none; or why there is
     none."""
+    sites = [bus for bus, mw in asked[0].items() if mw > 0]
+    coupled = {} if facility is None else dict.fromkeys(sites, facility.dae)
+    return _simulated(grid, asked, coupled, values)
+
+
+def _simulated(
+    grid: Grid,
+    asked: Asked,
+    coupled: Mapping[int, Dae],
+    values: Mapping[str, float],
+    wrt: Sequence[str] = (),
+) -> Mapping[Fault, FaultRun] | str:
+    """Runs of all faults by the native engine, or why there is none."""
     hosting, period, faults, until, step = asked
-    sites = [bus for bus, mw in hosting.items() if mw > 0]
-    coupled = None if facility is None else dict.fromkeys(sites, facility.dae)
+    more = values if coupled else {}
     try:
         return grid.waveforms_of(
-            hosting, period, faults, until, step=step, facilities=coupled, values=values if coupled else None
+            hosting, period, faults, until, step=step, wrt=wrt, facilities=coupled, values=more
         )
     except (SimulationError, InfeasibleError) as error:
         return str(error)

@@ -1,10 +1,10 @@
 """Plans with their facilities in the network: how far the margins of the open loop are off.
 
-Samples, searches and replays take hosted load as an impedance in the fault. This phase simulates plans once
-more with the facilities as ports of the network, by the native engine: the largest plan of each mode that
-passed, or every plan where the study asks for the closed loop. Then a plan that does not ride through there
-has not passed. Studies whose faults ANDES simulates are left alone: their case may be one that the native
-engine does not know.
+The open loop takes hosted load as an impedance in the fault. This phase simulates plans in both loops by the
+native engine: the largest plan of each mode that passed, or every plan where the study asks for the closed
+loop. Then samples and searches are in closed loop, and a plan that does not ride through there has not
+passed. Studies whose faults ANDES simulates are left alone: their case may be one that the native engine does
+not know.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
-from dcvrt.studies.comparison import comparison
+from dcvrt.studies.comparison import comparison, fault_runs
 from dcvrt.studies.store import RUN_FAILED, Store, records
 from dcvrt.studies.system_limit import system_limits
 
@@ -180,7 +180,7 @@ def simulations(store: Store) -> dict[str, int]:
     A fault without a waveform is one failure, however many facility runs it would have fed.
     """
     margins, tasks = store.margins(), store.tasks()
-    faults = margins[margins.failed_in != "task"].drop_duplicates(["hosting", "period", "fault"])
+    faults = fault_runs(store, margins[margins.failed_in != "task"])
     ran = margins[margins.failed_in.isin(["", *RUN_FAILED])]
     return {
         "grid": len(faults),

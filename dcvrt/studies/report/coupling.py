@@ -28,21 +28,25 @@ def coupling(findings: Findings) -> Safe:
         else:
             why = "the store holds no comparison"
         return section(TITLE, paragraph(f"Closed and open loop were not compared: {why}."), name=ANCHOR)
-    asked = (
-        "As the study asks, a plan has passed only if it rides through in closed loop too."
-        if findings.study.grid.coupling == "closed"
-        else "As the study asks, only the largest plan of each mode is compared; its verdict stays that of "
-        'the open loop. coupling = "closed" in [grid] holds every plan against the closed loop.'
-    )
-    detail = [pair for pair in compared if pair[0] in [findings.best(mode) for mode in findings.modes]]
+    if findings.study.grid.coupling == "closed":
+        asked = (
+            "As the study asks, samples and searches are in closed loop too. A plan has passed only if it "
+            "rides through there and in its replay, which takes hosted load as an impedance in the fault "
+            "(open loop)."
+        )
+    else:
+        asked = (
+            "Samples, searches and replays take hosted load as an impedance in the fault (open loop). As the "
+            "study asks, only the largest plan of each mode is compared; its verdict stays that of the open "
+            'loop. coupling = "closed" in [grid] searches for plans that ride through in closed loop.'
+        )
+    largest = [findings.best(mode) for mode in findings.modes]
     return section(
         TITLE,
         paragraph(
-            "Samples, searches and replays take hosted load as an impedance in the fault (open loop). Here "
-            "the facilities are ports of the network, with their control, limits and supervisor, so that "
-            "they act on the voltage that they see (closed loop). Both loops by the native engine; "
-            "differences are closed less open, and a negative one means less margin. "
-            f"{asked}"
+            "In closed loop the facilities are ports of the network, with their control, limits and "
+            f"supervisor, so that they act on the voltage that they see. {asked} Both loops here are by the "
+            "native engine; differences are closed less open, and a negative one means less margin."
         ),
         table(
             "Largest differences of each plan, over all faults, periods and sites",
@@ -51,7 +55,7 @@ def coupling(findings: Findings) -> Safe:
             [_summary(row, frame) for row, frame in compared],
             words=[8, 9],
         ),
-        *[_runs(row, frame) for row, frame in detail],
+        *[_runs(row, frame) for row, frame in compared if row in largest],
     )  # fmt: skip
 
 
