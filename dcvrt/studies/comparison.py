@@ -78,7 +78,8 @@ def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any
 
 def fault_runs(store: Store, margins: pd.DataFrame) -> pd.DataFrame:
     """The first facility run of every fault simulation; in closed loop each mode and rating has its own."""
-    closed = store.provenance()["study"]["grid"]["coupling"] == "closed"
+    study = store.provenance().get("study")
+    closed = study is not None and study["grid"]["coupling"] == "closed"
     roles = dict(zip(store.hostings().name, store.hostings().role, strict=True))
     kinds = [KINDS[roles[name]] for name in margins.hosting]
     runs = zip(kinds, margins["mode"], margins.beta, strict=True)

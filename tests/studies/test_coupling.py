@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 
 from dcvrt.planning import coupling as planning
-from dcvrt.studies import coupling
+from dcvrt.planning import replay
+from dcvrt.studies import coupling, outputs
 from dcvrt.studies.campaign import Campaign, InProcess
 from dcvrt.studies.config import load
 from dcvrt.studies.findings import Findings
+from dcvrt.studies.phases import hosting_row
 from dcvrt.studies.report import coupling as report
 from dcvrt.studies.store import Store, records
 from tests.studies.synthetic import make
@@ -142,3 +144,19 @@ def test_the_report_tells_how_far_the_open_loop_is_off(tmp_path: Path) -> None:
     assert "bus 25, 100 ms peak 75 0.6200 0.6100 0.0800 0.0790 0.0200 -0.0300 no" in told
     (sentence,) = report.turned(findings)
     assert "1 of 2 runs, the first at bus 75, fault bus 25, 100 ms, peak: a margin is negative" in sentence
+
+
+@pytest.mark.parametrize(("coupled", "count"), [("open", 2), ("closed", 3)])
+def test_each_mode_and_rating_has_its_own_fault_simulations_in_closed_loop(
+    tmp_path: Path, coupled: str, count: int
+) -> None:
+    """Two ratings of a sample share a simulation in open loop only; replays share theirs in both."""
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        store.note(study=setting(coupled).file.canonical())
+        for name, role in (("s0000", "sample"), ("p40", "plan")):
+            store.put("hostings", [hosting_row(name, role, "", {21: 40.0, 75: 0.0})])
+            for beta in (1.2, 1.3):
+                place = ("peak", "bus 25, 100 ms", 21, "gfl", beta)
+                store.put("margins", [{"hosting": name, **replay._row(*place, 40.0, "", "")}])
+        assert outputs.simulations(store)["grid"] == count
+        assert outputs.simulations(store)["facility"] == 4
