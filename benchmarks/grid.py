@@ -20,7 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.harness import Result, least, result
-from dcvrt import facility
+from dcvrt import Simulator, facility
+from dcvrt.criteria import Criteria
+from dcvrt.dae import Dae
 from dcvrt.grid import BusFault, FaultRun, Grid, Period, andes
 from dcvrt.grid.faults import Fault
 from dcvrt.grid.native.engine import sample_times, thetas
@@ -32,9 +34,12 @@ STEP = 1 / 120
 UNTIL = 5.0
 SITES = (21, 75, 106, 108)
 HOSTING = {21: 31.4, 75: 153.9, 106: 102.4, 108: 104.1}
+RATING = 1.3
+"""Of the facilities in the closed loop."""
 FAULTS = (22, 23, 17, 74, 100, 103, 105, 109, 30, 78, 92, 65)
 OTHERS = {
     "kundur_full": ("kundur/kundur_full.xlsx", 7, 8),
+    "ieee14": ("ieee14/ieee14.raw", 9, 4),
     "ieee39_full": ("ieee39/ieee39_full.xlsx", 20, 16),
 }
 """Case: file in the package of ANDES, bus that is looked at, bus of the fault."""
@@ -46,6 +51,7 @@ def run(smoke: bool = False) -> list[Result]:
     grid = Grid.from_case("ieee118", sites=SITES)
     rows = _accuracy(grid, faults, until)
     rows += _times(grid, until, smoke)
+    rows += _closed_loop(grid, until, smoke)
     if not smoke:
         rows += [row for name in OTHERS for row in _other(name)]
     return rows
@@ -178,15 +184,11 @@ def _times(grid: Grid, until: float, smoke: bool) -> list[Result]:
     by = thetas(("H",), SITES, grid.network)
     point = engine.point(HOSTING, Period())
     point.simulate(stages, times, engine.options)
-    closed = {bus: facility.gfl() for bus in SITES[:1]}
-    same = next(iter(closed.values()))
-    closed = dict.fromkeys(SITES, same)
-    same.set("beta", 1.3)
     many = [BusFault(bus) for bus in FAULTS[:10]]
 
-    def new(wrt: tuple[str, ...] = (), facilities: Any = None) -> None:
+    def new(wrt: tuple[str, ...] = ()) -> None:
         found = by if wrt else ()
-        made = engine.point(HOSTING, Period(), found, facilities)
+        made = engine.point(HOSTING, Period(), found)
         engine.simulate(made, fault, times, found)
 
     def ten() -> None:
@@ -206,9 +208,51 @@ def _times(grid: Grid, until: float, smoke: bool) -> list[Result]:
         result(case, "the same with 4 sensitivities", least(lambda: new(("H",)), budget), "s",
                "ANDES 1/120 s", whole, error),
         result(case, "10 faults of one operating point", len(many) / together, "simulations/s"),
-        result(case, "closed loop, 4 facilities", least(lambda: new((), closed), budget) / open_loop,
-               "of the open loop"),
     ]  # fmt: skip
+
+
+def _waveforms(
+    grid: Grid, faults: Sequence[BusFault], until: float, coupled: Mapping[int, Dae] | None
+) -> Mapping[Fault, FaultRun]:
+    values = {"beta": RATING} if coupled else None
+    return grid.waveforms_of(HOSTING, None, faults, until, step=STEP, facilities=coupled, values=values)
+
+
+def _facility_runs(simulator: Simulator, found: Mapping[Fault, FaultRun], pf: float) -> None:
+    at_sites = [run[bus] for run in found.values() for bus in SITES]
+    simulator.batch(at_sites, {"H": 1.0, "beta": RATING, "pf": pf}, criteria=Criteria())
+
+
+def _closed_loop(grid: Grid, until: float, smoke: bool) -> list[Result]:
+    """Facilities as ports of the network, from a new hosting vector on, over the open loop.
+
+    The open loop leaves the facilities out; to know what they do, each is run on the waveform of its site,
+    with margins. That is given three ways: both loops without these runs, only the open loop with them, both
+    with them.
+    """
+    return [
+        row
+        for mode in ("gfl", "gfm")
+        for count in ((1,) if smoke else (1, 10))
+        for row in _one_closed_loop(grid, mode, count, until, 0.2 if smoke else 1.0)
+    ]
+
+
+def _one_closed_loop(grid: Grid, mode: str, count: int, until: float, budget: float) -> list[Result]:
+    dae = facility.get(mode).compile()
+    simulator, coupled = Simulator(dae), dict.fromkeys(SITES, dae)
+    faults = [BusFault(bus) for bus in FAULTS[:count]]
+    found = _waveforms(grid, faults, until, None)
+    open_loop = least(lambda: _waveforms(grid, faults, until, None), budget)
+    closed = least(lambda: _waveforms(grid, faults, until, coupled), budget)
+    runs = least(lambda: _facility_runs(simulator, found, grid.pf), budget)
+    case = f"closed loop, 4 {mode}, {count} fault(s), {until:g} s"
+    with_runs = "of the open loop's with its facility runs"
+    return [
+        result(case, "waveforms", closed / open_loop, "of the open loop's"),
+        result(case, "waveforms", closed / (open_loop + runs), with_runs),
+        result(case, "waveforms and facility runs", (closed + runs) / (open_loop + runs), with_runs),
+    ]
 
 
 def _same_fault_error(grid: Grid, fault: BusFault, until: float) -> float:

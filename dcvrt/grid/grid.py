@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +14,14 @@ import numpy.typing as npt
 from dcvrt.dae import Dae
 from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
-from dcvrt.grid.faults import BusFault, Fault, FaultSequence, LineTrip, branch
+from dcvrt.grid.fault_run import FaultRun
+from dcvrt.grid.faults import BusFault, Fault
 from dcvrt.grid.native.engine import Engine, sample_times, thetas
 from dcvrt.grid.native.steady import Flow, loads
 from dcvrt.grid.network import Network
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.period import Period
+from dcvrt.grid.request import Request
 from dcvrt.models import Diagram
 from dcvrt.models.machines import UnitBlock
 from dcvrt.waveform import Waveform
@@ -26,7 +29,6 @@ from dcvrt.waveform import Waveform
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
-ENGINES = ("native", "andes")
 STEP = 1.0 / 120.0
 """Default sample distance, s, and the step of ANDES: its complex voltages are 2e-4 pu off in a fault and
 4e-4 pu
@@ -34,42 +36,15 @@ after, against 1/1920 s; twice the step takes half the time and has four times t
 chooses its own steps."""
 
 
-@dataclass(frozen=True, eq=False)
-class FaultRun(Mapping[int, Waveform]):
-    """One fault at one operating point: bus -> waveform, or the sentence on why there is none.
-
-    Parameters
-    ----------
-    fault : BusFault, LineTrip or FaultSequence
-    waveforms : mapping of bus to Waveform
-        Empty when the simulation did not reach its end.
-    status : str
-        How it ended.
-    """
+class _Found(NamedTuple):
+    """What an engine gives of one fault: voltages (samples, sites) with their tangents."""
 
     fault: Fault
-    waveforms: Mapping[int, Waveform]
+    t: Floats
+    v: Phasors
+    tangents: Mapping[str, Phasors]
     status: str
-
-    @property
-    def completed(self) -> bool:
-        """Whether the simulation reached its end."""
-        return bool(self.waveforms)
-
-    def require(self) -> FaultRun:
-        """Return itself, or raise `SimulationError` with `status`."""
-        if not self.completed:
-            raise SimulationError(self.status)
-        return self
-
-    def __getitem__(self, bus: int) -> Waveform:
-        return self.require().waveforms[bus]
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self.waveforms)
-
-    def __len__(self) -> int:
-        return len(self.waveforms)
+    notes: Sequence[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +69,7 @@ class Grid:
         Who supplies a change of load. `proportional`: all scheduled units in proportion to their schedule, up
         to their limits, losses included; `slack`: the unit at the slack bus.
     reactive_limits : bool
-        Whether the power flow keeps units within their reactive limits; the slack bus has none.
+        Whether the power flow keeps units within their reactive limits.
     load_model, wind_model : block of `dcvrt.models.machines`, optional
         What network loads and wind are in a fault, for the native engine: `ExponentialLoad`, `ZipLoad`,
         `CurrentConverter`. Impedances when not given.
@@ -138,7 +113,7 @@ class Grid:
         redispatch : str
             `proportional` or `slack`.
         reactive_limits : bool
-            Whether the power flow keeps units within their reactive limits; the slack bus has none.
+            Whether the power flow keeps units within their reactive limits.
         load_model, wind_model : block of `dcvrt.models.machines`, optional
             What network loads and wind are in a fault, for the native engine; impedances when not given.
 
@@ -187,6 +162,7 @@ class Grid:
         step: float = STEP,
         wrt: Sequence[str] = (),
         facilities: Mapping[int, Diagram | Dae] | None = None,
+        values: Mapping[str, float] | None = None,
     ) -> dict[int, Waveform]:
         """POI voltage at every site under one fault.
 
@@ -207,12 +183,14 @@ class Grid:
         wrt : sequence of str
             Quantities that the waveforms carry tangents of, with `native`: `H` (every site) or `H_<bus>`, MW;
             `wind_<bus>`, MW; `load`, factor on every load of the network; `clear`, time at which the fault is
-            cleared, s.
+            cleared, s; `beta`, rating of all facilities in the network.
         facilities : mapping of site to Diagram or Dae, optional
             Facilities that act back on the network, with `native`; what is hosted at other sites is a
-            constant
-            impedance in the fault. Each has the site's capacity, the period's load factor and the grid's
-            power factor; its own `beta`. A Dae, once compiled, is prepared once; a Diagram in every call.
+            constant impedance in the fault. Each has the site's capacity, the period's load factor and the
+            grid's power factor; its own `beta`. A Dae, once compiled, is prepared once; a Diagram in every
+            call.
+        values : mapping of parameter path to value, optional
+            Values of the facilities' parameters in place of their own: ``{"beta": 1.2}``.
 
         Returns
         -------
@@ -230,7 +208,7 @@ class Grid:
         InfeasibleError
             When the units cannot supply the load.
         """
-        runs = self.waveforms_of(hosting, period, [fault], until, engine, step, wrt, facilities)
+        runs = self.waveforms_of(hosting, period, [fault], until, engine, step, wrt, facilities, values)
         return dict(runs[fault].require().waveforms)
 
     def waveforms_of(
@@ -243,67 +221,56 @@ class Grid:
         step: float = STEP,
         wrt: Sequence[str] = (),
         facilities: Mapping[int, Diagram | Dae] | None = None,
+        values: Mapping[str, float] | None = None,
     ) -> dict[Fault, FaultRun]:
         """Several faults of one operating point, which is solved and initialised once; see `waveforms`.
 
         A fault whose simulation does not reach its end stays in, with its status. An operating point that has
         no power flow or no equilibrium raises `SimulationError`: it has no faults to simulate.
         """
-        period = period or Period()
-        self._check_request(hosting, period, faults, until, engine, step, wrt, facilities)
-        once = list(dict.fromkeys(faults))
-        found = self._by_andes if engine == "andes" else self._by_own_engine
+        asked = Request(
+            hosting, period or Period(), faults, until, engine, step, wrt, facilities or {}, values or {}
+        )
+        asked.check(self)
         runs = {}
-        for fault, (t, v, tangents, status) in found(hosting, period, once, until, step, wrt, facilities):
-            name = f"{self.name}, {period.name}, fault at {fault.label}"
-            reached = () if status else enumerate(self.sites)
+        for found in self._by_andes(asked) if engine == "andes" else self._by_own_engine(asked):
+            name = f"{self.name}, {asked.period.name}, fault at {found.fault.label}"
+            reached = () if found.status else enumerate(self.sites)
             waveforms = {
                 bus: Waveform.from_samples(
-                    t, v[:, k], {q: dv[:, k] for q, dv in tangents.items()}, name=f"{name}, bus {bus}"
+                    found.t,
+                    found.v[:, k],
+                    {q: dv[:, k] for q, dv in found.tangents.items()},
+                    name=f"{name}, bus {bus}",
                 )
                 for k, bus in reached
             }
-            runs[fault] = FaultRun(fault, waveforms, f"{name}: {status or 'completed.'}")
+            ended = found.status or "completed."
+            if found.notes:
+                ended += f" Counts as on its limit at the start: {'; '.join(found.notes)}."
+            runs[found.fault] = FaultRun(found.fault, waveforms, f"{name}: {ended}")
         return runs
 
-    def _by_andes(
-        self,
-        hosting: Mapping[int, float],
-        period: Period,
-        faults: Sequence[Fault],
-        until: float,
-        step: float,
-        wrt: Sequence[str],
-        facilities: Mapping[int, Diagram | Dae] | None,
-    ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
-        bolted = [fault for fault in faults if isinstance(fault, BusFault)]
-        point = self.operating_point(hosting, period, bolted)
+    def _by_andes(self, asked: Request) -> Iterator[_Found]:
+        bolted = [fault for fault in dict.fromkeys(asked.faults) if isinstance(fault, BusFault)]
+        point = self.operating_point(asked.hosting, asked.period, bolted)
         for fault in bolted:
-            times = sample_times(fault.stages(self.network), until, step)
+            times = sample_times(fault.stages(self.network), asked.until, asked.step)
             v, status = point.simulate(fault, times, self.sites)
-            yield fault, (np.concatenate(times), v, {}, status)
+            yield _Found(fault, np.concatenate(times), v, {}, status, point.notes)
 
-    def _by_own_engine(
-        self,
-        hosting: Mapping[int, float],
-        period: Period,
-        faults: Sequence[Fault],
-        until: float,
-        step: float,
-        wrt: Sequence[str],
-        facilities: Mapping[int, Diagram | Dae] | None,
-    ) -> Iterator[tuple[Fault, tuple[Floats, Phasors, dict[str, Phasors], str]]]:
-        by = thetas(wrt, self.sites, self.network)
-        point = self.native.point(hosting, period, by, facilities)
-        for fault in faults:
-            times = sample_times(fault.stages(self.network), until, step)
+    def _by_own_engine(self, asked: Request) -> Iterator[_Found]:
+        by = thetas(asked.wrt, self.sites, self.network)
+        point = self.native.point(asked.hosting, asked.period, by, asked.facilities, asked.values)
+        for fault in dict.fromkeys(asked.faults):
+            times = sample_times(fault.stages(self.network), asked.until, asked.step)
             try:
                 run = self.native.simulate(point, fault, times, by)
             except SimulationError as error:  # islands: this fault has no result, the others may have
-                yield fault, (np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error))
+                yield _Found(fault, np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error), ())
                 continue
             tangents = {q.name: run.tangents[:, k] for k, q in enumerate(by)}
-            yield fault, (np.concatenate(times), run.v, tangents, run.status)
+            yield _Found(fault, np.concatenate(times), run.v, tangents, run.status, point.notes)
 
     @cached_property
     def native(self) -> Engine:
@@ -385,93 +352,9 @@ class Grid:
         if self.redispatch not in redispatch.RULES:
             hint = did_you_mean(self.redispatch, redispatch.RULES)
             problems.append(f"redispatch = {self.redispatch!r} is not known.{hint}")
-        raise_all(problems + [f"site: {line}" for line in self._unknown(self.sites)], self.name)
+        raise_all(problems + [f"site: {line}" for line in self.unknown(self.sites)], self.name)
 
-    def _unknown(self, buses: Sequence[int]) -> list[str]:
+    def unknown(self, buses: Sequence[int]) -> list[str]:
+        """A sentence for every bus that the network does not have."""
         known = set(self.network.bus.tolist())
         return [f"no bus {bus}.{did_you_mean(bus, self.network.bus)}" for bus in buses if bus not in known]
-
-    def _check_request(
-        self,
-        hosting: Mapping[int, float],
-        period: Period,
-        faults: Sequence[Fault],
-        until: float,
-        engine: str,
-        step: float,
-        wrt: Sequence[str],
-        facilities: Mapping[int, Diagram | Dae] | None,
-    ) -> None:
-        problems = []
-        if engine not in ENGINES:
-            problems.append(f"engine = {engine!r} is not known.{did_you_mean(engine, ENGINES)}")
-        if engine == "andes":
-            if wrt:
-                problems.append("wrt: ANDES gives no derivatives. Way out: engine='native'.")
-            if self.load_model or self.wind_model:
-                problems.append(
-                    "load_model, wind_model: engine='andes' has loads and wind as impedances. Way out: "
-                    "engine='native'."
-                )
-            problems += [
-                f"fault {fault.label}: engine='andes' takes bus faults only. Way out: engine='native'."
-                for fault in dict.fromkeys(faults)
-                if not isinstance(fault, BusFault)
-            ]
-        else:
-            problems += self._problems(thetas, wrt, self.sites, self.network)
-        if facilities and engine == "andes":
-            problems.append("facilities: ANDES has no model of them. Way out: engine='native'.")
-        problems += [
-            f"facilities: bus {bus} is not a candidate site.{did_you_mean(bus, self.sites)}"
-            for bus in facilities or {}
-            if bus not in self.sites
-        ]
-        problems += [
-            f"facilities: {type(diagram).__name__} at bus {bus} is no diagram. Way out: facility.gfl() and "
-            "its like."
-            for bus, diagram in (facilities or {}).items()
-            if engine == "native" and not isinstance(diagram, Diagram | Dae)
-        ]
-        for bus, mw in hosting.items():
-            if bus not in self.sites:
-                problems.append(f"hosting at bus {bus}: not a candidate site.{did_you_mean(bus, self.sites)}")
-            if not np.isfinite(mw) or mw < 0:
-                problems.append(f"hosting at bus {bus} = {mw} MW must be a number of at least 0.")
-        problems += [f"wind: {line}" for line in self._unknown(list(period.wind))]
-        if not faults:
-            problems.append("faults is empty: at least one fault is needed.")
-        for fault in dict.fromkeys(faults):
-            events = fault.events if isinstance(fault, FaultSequence) else (fault,)
-            for event in events:
-                if isinstance(event, LineTrip):
-                    problems += self._problems(branch, self.network, event.from_bus, event.to_bus)
-                    continue
-                problems += [f"fault: {line}" for line in self._unknown([event.bus])]
-                if event.bus in self.sites:
-                    problems.append(
-                        f"fault at bus {event.bus}: it is a candidate site, and no site rides through "
-                        "a fault at "
-                        "its own bus. Way out: a fault at a neighbouring bus."
-                    )
-            if isinstance(fault, FaultSequence) and not problems:
-                problems += self._problems(fault.stages, self.network)
-            if until <= fault.cleared_at:
-                problems.append(
-                    f"fault at {fault.label}: until = {until:g} s ends before it is cleared at "
-                    f"{fault.cleared_at:g} s."
-                )
-        if not np.isfinite(until):
-            problems.append(f"until = {until} s is not a finite number.")
-        if not 0 < step <= 0.05:
-            problems.append(f"step = {step} s must be above 0 and at most 0.05 s.")
-        raise_all(problems, self.name)
-
-    def _problems(self, check: Callable[..., object], *given: object) -> list[str]:
-        """What a check that raises `InputError` says, as a list without the name of the grid."""
-        try:
-            check(*given)
-        except InputError as error:
-            first, *others = str(error).splitlines()
-            return [line.strip() for line in others] or [first.removeprefix(f"{self.network.name}: ")]
-        return []

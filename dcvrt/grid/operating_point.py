@@ -12,6 +12,7 @@ from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import redispatch
 from dcvrt.grid.andes import NO_MACHINES, Said, quiet
 from dcvrt.grid.faults import BusFault
+from dcvrt.grid.native.fleet import ON_LIMIT
 from dcvrt.grid.trapezoid import NoConvergenceError, Stepper
 
 Floats = npt.NDArray[np.float64]
@@ -90,8 +91,9 @@ class OperatingPoint:
             reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
             system.PQ.p0.v[:loads] *= load_scale
             system.PQ.q0.v[:loads] *= load_scale
-            for k, bus in enumerate(system.PV.bus.v):
-                system.PV.v0.v[k] = (set_points or {}).get(bus, system.PV.v0.v[k])
+            for units in (system.PV, system.Slack):
+                for k, bus in enumerate(units.bus.v):
+                    units.v0.v[k] = (set_points or {}).get(bus, units.v0.v[k])
             self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
             self._initialise(said)
 
@@ -167,13 +169,17 @@ class OperatingPoint:
         tds.init()
         if not tds.initialized:
             raise SimulationError(f"{self.where}: ANDES could not initialise the dynamic devices. {said}")
-        moved = []
+        moved, notes = [], []
         for (model, limit), value in zip(limits, before, strict=True):
-            moved += [
-                f"{model.class_name} '{model.idx.v[k]}': {limit.name} = {value[k]:.4g} pu, but "
-                f"{limit.v[k]:.4g} pu is needed"
-                for k in np.flatnonzero(limit.v != value)
-            ]
+            for k in np.flatnonzero(limit.v != value):
+                name = f"{model.class_name} '{model.idx.v[k]}'"
+                beyond = abs(limit.v[k] - value[k])
+                if beyond > ON_LIMIT:
+                    moved.append(
+                        f"{name}: {limit.name} = {value[k]:.4g} pu, but {limit.v[k]:.4g} pu is needed"
+                    )
+                else:
+                    notes.append(f"{name}: {limit.name} by {beyond:.1g} pu")
         if moved:
             more = f"; and {len(moved) - 4} more" if len(moved) > 4 else ""
             raise SimulationError(
@@ -183,12 +189,27 @@ class OperatingPoint:
             )
         residual = np.abs(system.dae.fg)
         worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
-        if not residual[worst] <= FLAT_START_TOLERANCE:
+        size, name = float(residual[worst]), system.dae.xy_name[worst]
+        clipped = self._clipped() if FLAT_START_TOLERANCE < size <= ON_LIMIT else []
+        if not (size <= FLAT_START_TOLERANCE or clipped):
             raise SimulationError(
-                f"{self.where}: the start is no equilibrium; the largest residual, {residual[worst]:.3g} pu, "
-                f"is that of {system.dae.xy_name[worst]}. {said}".rstrip()
+                f"{self.where}: the start is no equilibrium; the largest residual, {size:.3g} pu, "
+                f"is that of {name}. {said}".rstrip()
             )
-        self.residual = float(residual[worst])
+        self.notes = (*notes, *(f"{limit} by {size:.1g} pu" for limit in clipped))
+        self.residual = size
+
+    def _clipped(self) -> list[str]:
+        """States that the start puts onto a limit of theirs, which is where a small residual comes from."""
+        return [
+            f"{model.class_name} '{model.idx.v[k]}': {getattr(part, side).name}"
+            for model in self.system.exist.tds.values()
+            if model.n
+            for part in model.discrete.values()
+            if type(part).__name__.startswith("AntiWindup")
+            for side, flag in (("lower", part.zl), ("upper", part.zu))
+            for k in np.flatnonzero(flag)
+        ]
 
     @property
     def v0(self) -> Phasors:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,94 +11,24 @@ import numpy.typing as npt
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from dcvrt.errors import InputError, SimulationError
+from dcvrt.errors import SimulationError
 from dcvrt.grid.network import Network
+from dcvrt.grid.steering import Steering
+from dcvrt.grid.switching import LOOKS, Limited, reactive_limits_at, switched
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Phasors = npt.NDArray[np.complex128]
-Limited = npt.NDArray[np.int8]
-"""Of each `pv` bus: 1 at its largest, -1 at its smallest reactive output, 0 where it holds its voltage."""
 
 TOLERANCE = 1e-9
 """Largest power mismatch of a solution, pu on the system base."""
-LIMIT_TOLERANCE = 1e-8
-"""Excess over a reactive limit, and difference to a set point, that switches no bus, pu."""
 CLOSE = 1e-4
 """Mismatch below which hours of a batch are looked at for buses that switch, pu."""
-LOOKS = 40
-"""Switches of an hour before it counts as unsolved; after half of them no bus is released any more."""
 LEVEL = 0.02
 """Hours whose load lies within so much of the reference load share one Jacobian."""
 MOST_LEVELS = 60
 DENSE = 1000
 """Buses up to which the Jacobian is a dense matrix."""
-
-
-def participation(network: Network) -> Floats:
-    """Share of each generator in a change of net load: its scheduled output over the sum of all.
-
-    Units that are scheduled to take power in, or nothing, have share 0. The shares sum to 1.
-
-    Raises
-    ------
-    InputError
-        When no unit is scheduled to generate.
-    """
-    scheduled = np.maximum(network.generators.p_set, 0.0)
-    if scheduled.sum() <= 0:
-        raise InputError(
-            f"{network.name}: no generator is scheduled to generate, so none can follow the load. "
-            "Way out: give p_set of at least one unit."
-        )
-    return scheduled / scheduled.sum()
-
-
-def dispatch(network: Network, net_load: Floats | float) -> Floats:
-    """Output of each generator, MW, when all follow the net load in proportion to their schedule.
-
-    Losses are not in it: the slack bus takes them. The limits p_min and p_max are not looked at.
-
-    Parameters
-    ----------
-    net_load : float or array (hours,)
-        Load and hosted load less wind, MW.
-
-    Returns
-    -------
-    array (generators,) or (generators, hours)
-    """
-    return np.multiply.outer(participation(network), net_load)
-
-
-def injections(
-    network: Network, load: Floats, wind: Mapping[int, Floats], hosted: Mapping[int, Phasors] | None = None
-) -> Phasors:
-    """Scheduled bus injections in MVA, generation positive, of many operating hours.
-
-    Parameters
-    ----------
-    load : array (hours,)
-        Factor on every active and reactive load.
-    wind : mapping of bus number to array (hours,)
-        Wind power in MW, at unity power factor.
-    hosted : mapping of bus number to complex array (hours,)
-        Hosted load P + jQ in MVA, import positive.
-
-    Returns
-    -------
-    complex array (buses, hours)
-        Units follow the net load as `dispatch` says. At `pv` and `slack` buses Q is what holds the voltage.
-    """
-    load = np.atleast_1d(np.asarray(load, dtype=float))
-    power = -np.outer(network.p_load + 1j * network.q_load, load)
-    for bus, mw in wind.items():
-        power[network.index(bus)] += mw
-    for bus, mva in (hosted or {}).items():
-        power[network.index(bus)] -= mva
-    units = dispatch(network, -power.real.sum(axis=0))
-    np.add.at(power, network.generator_index, units)
-    return power
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,80 +109,6 @@ class HourlySolution:
         return self
 
 
-class _Steering:
-    """Approximate Newton steps of many hours from one Jacobian: it only steers, residuals are exact.
-
-    With unit limits enforced the Jacobian is kept in blocks, so that every hour can have its own buses that
-    hold Q instead of their voltage: of the rows and columns of those the Schur complement is inverted, once
-    for each set of buses that occurs.
-
-    Parameters
-    ----------
-    jacobian : matrix
-        By angles of `free`, sizes of `pq`, then sizes of `pv` buses; rows P of `free`, Q of `pq`, Q of `pv`.
-    basic : int
-        Rows and columns without the `pv` part.
-    """
-
-    def __init__(self, jacobian: Any, basic: int) -> None:
-        self.dense = isinstance(jacobian, np.ndarray)
-        self._factors: Any = None
-        inner = jacobian[:basic, :basic]
-        if self.dense:
-            inverse = np.linalg.inv(inner)
-            self._inverse = inverse.astype(np.float32)
-        else:
-            self._factors = spla.splu(sp.csc_matrix(inner))
-        self._column, self._row, self._schur = np.zeros((basic, 0)), np.zeros((0, basic)), np.zeros((0, 0))
-        if jacobian.shape[0] > basic:
-            outer, below, corner = (
-                jacobian[:basic, basic:],
-                jacobian[basic:, :basic],
-                jacobian[basic:, basic:],
-            )
-            if self.dense:
-                self._column, self._row = inverse @ outer, below @ inverse
-            else:
-                outer, below, corner = (np.asarray(m.toarray(), float) for m in (outer, below, corner))
-                self._column = np.asarray(self._factors.solve(outer), dtype=np.float64)
-                self._row = np.asarray(self._factors.solve(below.T.copy(), "T").T, dtype=np.float64)
-            self._schur = corner - below @ self._column
-        self._inverted: dict[bytes, Floats] = {}
-
-    def step(self, rest: Floats, at_limit: Limited) -> Floats:
-        """Step for residuals (rows, hours): angles, sizes at `pq`, sizes at `pv` buses (0 where held)."""
-        n = self._column.shape[0]
-        inner = self._solve(rest[:n])
-        if not at_limit.any():
-            return np.vstack([inner, np.zeros((len(self._schur), rest.shape[1]))])
-        short = rest[n:] - self._row @ rest[:n]
-        size = np.zeros_like(short)
-        for buses, hours in _same_sets(at_limit != 0):
-            key = buses.tobytes()
-            if key not in self._inverted:
-                block = np.linalg.inv(self._schur[np.ix_(buses, buses)])
-                self._inverted[key] = np.asarray(block, dtype=np.float64)
-            size[np.ix_(buses, hours)] = self._inverted[key] @ short[np.ix_(buses, hours)]
-        return np.vstack([inner - self._column @ size, size])
-
-    def _solve(self, rest: Floats) -> Floats:
-        if not self.dense:
-            return np.asarray(self._factors.solve(np.ascontiguousarray(rest)))
-        size = max(float(abs(rest).max(initial=0.0)), 1e-300)  # scaled: single precision underflows
-        return np.asarray(size * (self._inverse @ (rest / size).astype(np.float32)), dtype=np.float64)
-
-
-def _same_sets(chosen: npt.NDArray[np.bool_]) -> list[tuple[Integers, Integers]]:
-    """Sets of rows that occur in columns, each with its columns; columns without any are left out."""
-    packed = np.ascontiguousarray(np.packbits(chosen, axis=0).T)
-    code = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
-    order = np.argsort(code, kind="stable")
-    _, begin = np.unique(code[order], return_index=True)
-    groups = np.split(order, begin[1:])
-    sets = [(np.flatnonzero(chosen[:, hours[0]]), hours) for hours in groups]
-    return [(buses, hours) for buses, hours in sets if len(buses)]
-
-
 class PowerFlow:
     r"""Power flow equations of a network, in polar voltages.
 
@@ -290,13 +145,9 @@ class PowerFlow:
         self.moving = np.r_[self.pq, self.pv]
         """Buses whose voltage can move."""
         self._y = network.admittance()
-        at = network.generator_index
-        bus = len(network.bus)
-        units = network.generators
-        self.q_low, self.q_high = (
-            np.bincount(at, q, bus)[self.pv] / network.base_mva for q in (units.q_min, units.q_max)
-        )
-        self._steerings: dict[int, _Steering] = {}
+        self.q_low, self.q_high = reactive_limits_at(network, self.pv)
+        self.held = network.v_set[self.pv]
+        self._steerings: dict[int, Steering] = {}
 
     @cached_property
     def flat(self) -> Phasors:
@@ -356,15 +207,7 @@ class PowerFlow:
         if not len(self.pv):
             return limited
         q = (v[self.pv] * current[self.pv].conj() - s[self.pv]).imag
-        shape = (-1,) + (1,) * (q.ndim - 1)
-        size, held = abs(v[self.pv]), self.network.v_set[self.pv].reshape(shape)
-        beyond = (q > self.q_high.reshape(shape) + LIMIT_TOLERANCE).astype(np.int8)
-        beyond -= q < self.q_low.reshape(shape) - LIMIT_TOLERANCE
-        wrong = ((limited > 0) & (size > held + LIMIT_TOLERANCE)) | (
-            (limited < 0) & (size < held - LIMIT_TOLERANCE)
-        )
-        kept = np.where(wrong & back, 0, limited)
-        return np.where(limited == 0, beyond, kept).astype(np.int8)
+        return switched(limited, q, np.abs(v[self.pv]), self.held, self.q_low, self.q_high, back)
 
     def _jacobian(self, v: Phasors, sizes: Integers) -> Any:
         """Derivative of P of `free` and Q of `sizes` by the angles of `free` and the voltages of `sizes`."""
@@ -506,16 +349,16 @@ class PowerFlow:
         found, begin = np.unique(level[order], return_index=True)
         return list(zip(found.tolist(), np.split(order, begin[1:]), strict=True))
 
-    def _steering(self, level: int, v: Phasors) -> _Steering:
+    def _steering(self, level: int, v: Phasors) -> Steering:
         """The steering of a load level, made at `v` when it is first needed."""
         if level not in self._steerings:
             if len(self._steerings) > MOST_LEVELS:
                 self._steerings.clear()
-            self._steerings[level] = _Steering(self._jacobian(v, self.moving), len(self.free) + len(self.pq))
+            self._steerings[level] = Steering(self._jacobian(v, self.moving), len(self.free) + len(self.pq))
         return self._steerings[level]
 
     def _chord(
-        self, s: Phasors, start: Phasors, steering: _Steering, steps: int, limited: Limited
+        self, s: Phasors, start: Phasors, steering: Steering, steps: int, limited: Limited
     ) -> tuple[Phasors, Floats, Integers, Limited]:
         """Newton with one Jacobian for all columns; columns that are done leave the loop."""
         n, count = len(self.free), s.shape[1]
@@ -636,21 +479,3 @@ class PowerFlow:
                 "voltages have no derivative. Way out: host less."
             ) from None
         return x
-
-
-def hosting_directions(network: Network, sites: Sequence[int] | Integers, pf: float) -> Phasors:
-    r"""Change of all scheduled injections per MW hosted at each site, MVA.
-
-    The site takes :math:`1 + j\tan\arccos \mathrm{pf}`, and the units share the active part
-    (`participation`).
-
-    Returns
-    -------
-    complex array (sites, buses)
-    """
-    change = np.zeros((len(sites), len(network.bus)), dtype=complex)
-    np.add.at(
-        change.T, network.generator_index, np.repeat(participation(network)[:, None], len(sites), axis=1)
-    )
-    change[np.arange(len(sites)), network.indices(sites)] -= 1.0 + 1j * np.tan(np.arccos(pf))
-    return change

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from dcvrt.errors import InfeasibleError
 from dcvrt.grid.network import Network
-from dcvrt.grid.powerflow import HourlySolution, PowerFlow, hosting_directions, injections
+from dcvrt.grid.powerflow import HourlySolution, PowerFlow
+from dcvrt.grid.schedule import hosting_directions, injections
 from dcvrt.planning import reactive
 from dcvrt.planning.interpolation import VoltageDrop
 from dcvrt.planning.profiles import Year
@@ -60,7 +61,7 @@ class Tangent:
 class HostedFlow:
     """AC power flow of the operating hours at any capacities.
 
-    The units follow the hosted load as `powerflow.dispatch` says and the slack takes losses. `pv` buses hold
+    The units follow the hosted load as `schedule.dispatch` says and the slack takes losses. `pv` buses hold
     their voltage, with `reactive_limits` as far as their units can.
     """
 

@@ -94,6 +94,11 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                     f"fault[{k}]: is cleared at {cleared:g} s, after the end of the simulation at "
                     f"{grid.t_end_s:g} s. Way out: raise grid.t_end_s."
                 )
+        if grid.coupling == "closed" and grid.engine == "andes":
+            problems.append(
+                "grid.coupling = 'closed': grid.engine = 'andes' has no model of a facility. Way out: "
+                "grid.engine = 'native', or coupling = 'open'."
+            )
         sampling: SamplingSection | None = sections.get("sampling")
         if (
             sampling is not None

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dcvrt.studies.store import RUN_FAILED, Store, records
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PAPER, FRONTIER = "paper", "frontier"
 KINDS = {
@@ -73,6 +76,18 @@ def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+def fault_runs(store: Store, margins: pd.DataFrame) -> pd.DataFrame:
+    """The first facility run of every fault simulation; in closed loop each mode and rating has its own."""
+    study = store.provenance().get("study")
+    closed = study is not None and study["grid"]["coupling"] == "closed"
+    roles = dict(zip(store.hostings().name, store.hostings().role, strict=True))
+    kinds = [KINDS[roles[name]] for name in margins.hosting]
+    runs = zip(kinds, margins["mode"], margins.beta, strict=True)
+    own = ["" if not closed or kind.endswith("replay") else f"{mode} {beta}" for kind, mode, beta in runs]
+    keyed = margins.assign(run=own)
+    return keyed.drop_duplicates(["hosting", "period", "fault", "run"])
+
+
 def _simulations(store: Store) -> dict[str, dict[str, int]]:
     margins = store.margins()
     role = dict(zip(store.hostings().name, store.hostings().role, strict=True))
@@ -81,7 +96,7 @@ def _simulations(store: Store) -> dict[str, dict[str, int]]:
     for kind in dict.fromkeys(KINDS.values()):
         gradients = kind in ("frontier", "system_search")
         here = margins[(margins.kind == kind) & (margins.failed_in != "task")]
-        faults = here.drop_duplicates(["hosting", "period", "fault"])
+        faults = fault_runs(store, here)
         ran = here[here.failed_in != "grid"]
         spent[kind] = {
             "grid": len(faults),

@@ -51,6 +51,11 @@ class GridSection(Section):
     engine: Literal["native", "andes"] = Field(
         default="native", description="simulator of the faults of samples and searches"
     )
+    coupling: Literal["open", "closed"] = Field(
+        default="open",
+        description="'closed': samples and searches simulate facilities in the network, and a plan passes "
+        "only if it rides through there too; 'open': told of the largest plan of each mode",
+    )
     t_end_s: Positive = Field(default=2.0, description="length of every fault simulation")
     step_s: float = Field(default=1 / 120, gt=0, le=0.05, description="step of the fault simulation")
     redispatch: Literal["proportional", "slack"] = Field(

@@ -129,6 +129,12 @@ class Findings:
             return store.what_ifs()
 
     @cached_property
+    def coupling(self) -> pd.DataFrame:
+        """Margins of plans with the facilities in the network beside those without."""
+        with self._store() as store:
+            return store.coupling()
+
+    @cached_property
     def tasks(self) -> pd.DataFrame:
         """Tasks with their states."""
         with self._store() as store:

@@ -162,7 +162,13 @@ class _Campaign:
                 faults = [fault for p, fault in ask.places or () if p == period]
                 if faults:
                     request = setting.request(
-                        ask.H, period, runs, engine=engine, gradients=True, faults=faults
+                        ask.H,
+                        period,
+                        runs,
+                        engine=engine,
+                        gradients=True,
+                        faults=faults,
+                        closed=setting.closed,
                     )
                     jobs.append(Job(self._name(ask, "f"), request))
         self.lost += phases.simulate(self.campaign, FRONTIER, jobs)

@@ -1,5 +1,5 @@
 """What a study folder holds for people and programs, made from the store alone: summary.json, table.csv,
-validation.csv, frontier.json.
+validation.csv, coupling.csv, frontier.json.
 
 Each file is written beside itself and then moved into place: a file that is there is whole.
 """
@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
-from dcvrt.studies.comparison import comparison
+from dcvrt.studies.comparison import comparison, fault_runs
 from dcvrt.studies.store import RUN_FAILED, Store, records
 from dcvrt.studies.system_limit import system_limits
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FRONTIER = "frontier.json"
+FRONTIER, COUPLING = "frontier.json", "coupling.csv"
 SYSTEM_KEYS = (
     "mode", "beta", "limit", "limit_mw", "limit_share", "total_mw", "by_site", "passed", "ac_passed",
     "aggregate_loss_mw", "lost_whole", "price_mw_per_mw",
@@ -76,6 +76,7 @@ def write_results(folder: Path, store: Store) -> list[Path]:
     return [
         write_atomically(folder / TABLE, plan_table(store).to_csv(index=False)),
         write_atomically(folder / VALIDATION, validation_table(store).to_csv(index=False)),
+        write_atomically(folder / COUPLING, store.coupling().to_csv(index=False)),
         write_atomically(
             folder / FRONTIER,
             json.dumps(
@@ -179,7 +180,7 @@ def simulations(store: Store) -> dict[str, int]:
     A fault without a waveform is one failure, however many facility runs it would have fed.
     """
     margins, tasks = store.margins(), store.tasks()
-    faults = margins[margins.failed_in != "task"].drop_duplicates(["hosting", "period", "fault"])
+    faults = fault_runs(store, margins[margins.failed_in != "task"])
     ran = margins[margins.failed_in.isin(["", *RUN_FAILED])]
     return {
         "grid": len(faults),

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import DcvrtError, InputError
-from dcvrt.planning import replay
+from dcvrt.planning import coupling, replay
 from dcvrt.planning.exact import exact_of
 from dcvrt.planning.hosting import HostingProblem
 from dcvrt.planning.kept import one_sided, side_by_side
@@ -90,9 +90,10 @@ class Setting:
         gradients: bool = False,
         keep: bool = False,
         faults: Collection[str] | None = None,
+        closed: bool = False,
     ) -> dict[str, Any]:
         """The request of `dcvrt.planning.replay.check_hosting` for one hosting vector and period; of some
-        faults only, when their labels are given."""
+        faults only, when their labels are given; `closed` puts the facilities into the network."""
         grid, f = self.file.grid, self.file.facility
         path = grid.case if grid.case == "ieee118" else str((self.folder / grid.case).resolve())
         dynamics = None if grid.dynamics is None else str((self.folder / grid.dynamics).resolve())
@@ -119,7 +120,13 @@ class Setting:
             "engine": engine,
             "gradients": gradients,
             "keep": keep,
+            "coupling": "closed" if closed else "open",
         }
+
+    @property
+    def closed(self) -> bool:
+        """Whether samples and searches simulate the facilities in the network."""
+        return self.file.grid.coupling == "closed"
 
     @property
     def runs(self) -> list[tuple[str, float]]:
@@ -161,7 +168,12 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
         store.note(sampled_box_mw=dict(zip(map(str, setting.sites), samples.upper.tolist(), strict=True)))
     engine, gradients = setting.file.grid.engine, setting.file.sampling.gradients
     jobs = [
-        Job(f"s{k:04}", setting.request(H, period, setting.runs, engine=engine, gradients=gradients))
+        Job(
+            f"s{k:04}",
+            setting.request(
+                H, period, setting.runs, engine=engine, gradients=gradients, closed=setting.closed
+            ),
+        )
         for period in setting.periods
         for k, H in enumerate(samples.hosting.tolist())
     ]
@@ -260,7 +272,7 @@ def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:
         rows = replay.lost_rows(task.payload, reason, "task")
         store.put("margins", [{"hosting": names[task.key], **row} for row in rows])
 
-    return campaign.run(phase, tasks, replay.check_hosting, record, record_lost)
+    return campaign.run(phase, tasks, coupling.check_hosting, record, record_lost)
 
 
 # -- fits ----------------------------------------------------------------------------------------------------

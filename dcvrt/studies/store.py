@@ -56,6 +56,10 @@ binding and
                low and high, between which it was searched; rating (NULL when high is not enough). Derived
                from the waveforms of the replays, written as a whole and anew when its inputs change:
                `what_ifs_from` in `provenance` is their digest.
+`coupling`     margins of plans with the facilities in the network ('closed') beside those without ('open'),
+               by the native engine: hosting, mode, beta, period, fault, site; v_poi_min_open and _closed
+               (pu), voltage_ (margin, pu), loss_ (margin, share of load), passed_; same_sequence; status,
+               empty where both have margins.
 """
 
 from __future__ import annotations
@@ -76,10 +80,10 @@ from dcvrt.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 4
+VERSION = 5
+"""Of the tables below; a store of another version is refused."""
 RUN_FAILED = ("start", "facility")
 """Values of `failed_in` of facility runs that have no result."""
-"""Of the tables below; a store of another version is refused."""
 
 TABLES = {
     "provenance": "key TEXT PRIMARY KEY, value TEXT NOT NULL",
@@ -129,6 +133,11 @@ TABLES = {
     "method TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
     "n_waveforms INTEGER NOT NULL, low REAL NOT NULL, high REAL NOT NULL, rating REAL, "
     "PRIMARY KEY (mode, number)",
+    "coupling": "hosting TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, period TEXT NOT NULL, "
+    "fault TEXT NOT NULL, site INTEGER NOT NULL, v_poi_min_open REAL, v_poi_min_closed REAL, "
+    "voltage_open REAL, voltage_closed REAL, loss_open REAL, loss_closed REAL, passed_open INTEGER, "
+    "passed_closed INTEGER, same_sequence INTEGER NOT NULL, status TEXT NOT NULL, "
+    "PRIMARY KEY (hosting, mode, beta, period, fault, site)",
 }
 JSON_COLUMNS = {
     "by_site",
@@ -348,6 +357,10 @@ class Store:
     def what_ifs(self) -> pd.DataFrame:
         """Least ratings under varied assumptions, by mode; number 0 is the study as it is."""
         return self._frame("what_ifs", order="mode, number")
+
+    def coupling(self) -> pd.DataFrame:
+        """Margins of plans with the facilities in the network beside those without."""
+        return self._frame("coupling", order="hosting, mode, beta, period, fault, site")
 
     def waveforms(self, **where: Any) -> list[tuple[dict[str, Any], dict[str, npt.NDArray[np.float32]]]]:
         """Stored waveforms whose columns have the given values, e.g. `waveforms(site=75, mode='gfl')`.

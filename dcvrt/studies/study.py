@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, frontier, outputs, phases, what_if
+from dcvrt.studies import checks, config, coupling, frontier, outputs, phases, what_if
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
@@ -131,6 +131,7 @@ class Study:
                     fits = phases.run_fits(store, setting)
                     phases.run_plans(store, setting, fits, reporter)
                     lost += phases.run_replays(campaign, setting)
+                    lost += coupling.run_coupling(campaign, setting)
                     frontier.run_mechanisms(store, setting)
                     what_if.run_what_ifs(store, setting, reporter)
                 finally:

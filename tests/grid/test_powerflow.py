@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dcvrt.errors import InputError, SimulationError
-from dcvrt.grid import powerflow
+from dcvrt.grid import schedule
 from dcvrt.grid.network import Branches, Generators, Network
 from dcvrt.grid.powerflow import PowerFlow
 
@@ -94,7 +94,7 @@ def test_hour_without_a_solution_is_labelled_and_the_others_stay() -> None:
 
 
 def test_solution_meets_the_equations(network: Network, flow: PowerFlow) -> None:
-    injection = powerflow.injections(network, np.ones(1), {})[:, 0]
+    injection = schedule.injections(network, np.ones(1), {})[:, 0]
     v = flow.solve(injection).v
     power = v * (network.admittance() @ v).conj() * network.base_mva
     assert power.real[flow.free] == pytest.approx(injection.real[flow.free], abs=1e-6)
@@ -108,10 +108,10 @@ def test_solution_meets_the_equations(network: Network, flow: PowerFlow) -> None
 
 def test_units_share_load_and_hosted_load_by_schedule(network: Network) -> None:
     hosted = {75: np.array([100 + 20j])}
-    injection = powerflow.injections(network, np.array([0.8]), {80: np.array([60.0])}, hosted)
+    injection = schedule.injections(network, np.array([0.8]), {80: np.array([60.0])}, hosted)
     assert injection.real.sum() == pytest.approx(0.0, abs=1e-9)
     assert injection.imag.sum() == pytest.approx(-0.8 * network.q_load.sum() - 20)
-    units = powerflow.dispatch(network, 0.8 * network.p_load.sum() + 100 - 60)
+    units = schedule.dispatch(network, 0.8 * network.p_load.sum() + 100 - 60)
     scheduled = network.generators.p_set > 0
     ratio = units[scheduled] / network.generators.p_set[scheduled]
     assert ratio == pytest.approx(np.full(len(ratio), ratio[0]))
@@ -121,7 +121,7 @@ def test_units_share_load_and_hosted_load_by_schedule(network: Network) -> None:
 def test_no_scheduled_unit_is_refused(network: Network) -> None:
     idle = replace(network, generators=replace(network.generators, p_set=np.zeros(54)))
     with pytest.raises(InputError) as error:
-        powerflow.participation(idle)
+        schedule.participation(idle)
     assert str(error.value) == (
         "ieee118: no generator is scheduled to generate, so none can follow the load. "
         "Way out: give p_set of at least one unit."
@@ -131,7 +131,7 @@ def test_no_scheduled_unit_is_refused(network: Network) -> None:
 def test_batch_equals_single_solutions(network: Network, flow: PowerFlow) -> None:
     rng = np.random.default_rng(3)
     load, wind = rng.uniform(0.35, 1.0, 150), {69: rng.uniform(0, 200, 150), 89: rng.uniform(0, 200, 150)}
-    injection = powerflow.injections(network, load, wind)
+    injection = schedule.injections(network, load, wind)
     batch = flow.solve_hours(injection).require()
     for k in (0, 57, 149):
         assert batch.v[:, k] == pytest.approx(flow.solve(injection[:, k]).v, abs=1e-8)
@@ -139,9 +139,9 @@ def test_batch_equals_single_solutions(network: Network, flow: PowerFlow) -> Non
 
 def test_sensitivities_equal_central_differences(network: Network, flow: PowerFlow) -> None:
     load, d = np.array([0.5, 0.98]), np.array([0.9, 0.97])
-    change = powerflow.hosting_directions(network, SITES, 0.95)
+    change = schedule.hosting_directions(network, SITES, 0.95)
     H = np.array([30.0, 120.0, 60.0, 80.0])
-    base = powerflow.injections(network, load, {})
+    base = schedule.injections(network, load, {})
 
     def voltage(h: np.ndarray, k: int) -> np.ndarray:
         return abs(flow.solve(base[:, k] + d[k] * (change.T @ h)).v[flow.pq])
@@ -157,9 +157,9 @@ def test_sensitivities_equal_central_differences(network: Network, flow: PowerFl
 
 
 def test_hosting_direction_is_the_change_of_the_schedule(network: Network) -> None:
-    change = powerflow.hosting_directions(network, SITES, 0.98)
+    change = schedule.hosting_directions(network, SITES, 0.98)
     factor = 1 + 1j * np.tan(np.arccos(0.98))
     hosted = {int(b): np.array([10.0 * factor]) for b in SITES}
-    with_sites = powerflow.injections(network, np.ones(1), {}, hosted)[:, 0]
-    without = powerflow.injections(network, np.ones(1), {})[:, 0]
+    with_sites = schedule.injections(network, np.ones(1), {}, hosted)[:, 0]
+    without = schedule.injections(network, np.ones(1), {})[:, 0]
     assert with_sites - without == pytest.approx(10.0 * change.sum(axis=0), abs=1e-10)

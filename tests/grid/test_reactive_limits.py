@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dcvrt.grid import andes, powerflow
+from dcvrt.grid import andes, powerflow, schedule
 from dcvrt.grid.network import Branches, Generators, Network
 from dcvrt.grid.powerflow import PowerFlow
 from dcvrt.planning import profiles
@@ -81,7 +81,7 @@ def test_bus_switches_to_the_voltage_of_its_closed_form(
     load: complex, q_max: float, q_min: float, v_set: float, at: int
 ) -> None:
     case = condenser(0.2, q_max, q_min, load, v_set)
-    injection = powerflow.injections(case, np.ones(1), {})[:, 0]
+    injection = schedule.injections(case, np.ones(1), {})[:, 0]
     found = PowerFlow(case, reactive_limits=True).solve(injection)
     assert found.limited.tolist() == [at]
     limit = {1: q_max, -1: q_min, 0: np.nan}[at]
@@ -93,7 +93,7 @@ def test_bus_switches_to_the_voltage_of_its_closed_form(
 
 def test_without_limits_the_set_point_is_held_whatever_it_takes() -> None:
     case = condenser(0.2, 30.0, -30.0, 120 + 40j)
-    found = PowerFlow(case).solve(powerflow.injections(case, np.ones(1), {})[:, 0])
+    found = PowerFlow(case).solve(schedule.injections(case, np.ones(1), {})[:, 0])
     assert abs(found.v[1]) == pytest.approx(1.0)
     assert not found.limited.size
 
@@ -124,7 +124,7 @@ def test_every_bus_holds_its_voltage_or_is_at_the_right_limit(seed: int, load: f
         whole, generators=replace(units, q_min=narrow * units.q_min, q_max=narrow * units.q_max)
     )
     hosted = {int(b): np.array([(1 + 0.2j) * rng.uniform(0, 40)]) for b in SITES}
-    s = powerflow.injections(network, np.array([load]), {69: np.array([rng.uniform(0, 200)])}, hosted)
+    s = schedule.injections(network, np.array([load]), {69: np.array([rng.uniform(0, 200)])}, hosted)
     flow = PowerFlow(network, reactive_limits=True)
     batch = flow.solve_hours(s)
     if not batch.converged[0]:
@@ -140,7 +140,7 @@ def test_year_of_base_hours_is_at_limits_and_equals_single_solutions(
     network: Network, flow: PowerFlow
 ) -> None:
     year = profiles.ieee118()
-    s = powerflow.injections(network, year.load, year.wind)
+    s = schedule.injections(network, year.load, year.wind)
     batch = flow.solve_hours(s).require()
     assert (batch.limited != 0).any(axis=0).all()  # no hour in which every unit is within its limits
     for k in (0, 1156, 6028, 8441):
@@ -152,8 +152,8 @@ def test_year_of_base_hours_is_at_limits_and_equals_single_solutions(
 
 def test_warm_start_gives_the_same_solution(network: Network, flow: PowerFlow) -> None:
     year = profiles.ieee118().window(range(8400, 8500))
-    s = powerflow.injections(network, year.load, year.wind)
-    change = powerflow.hosting_directions(network, SITES, 0.98)
+    s = schedule.injections(network, year.load, year.wind)
+    change = schedule.hosting_directions(network, SITES, 0.98)
     before = flow.solve_hours(s).require()
     moved = s + np.outer(change.T @ np.array([25.0, 90.0, 55.0, 60.0]), year.dc)
     cold = flow.solve_hours(moved).require()
@@ -165,9 +165,9 @@ def test_warm_start_gives_the_same_solution(network: Network, flow: PowerFlow) -
 
 def test_sensitivities_equal_central_differences_at_limits(network: Network, flow: PowerFlow) -> None:
     d = np.array([0.9, 0.97])
-    change = powerflow.hosting_directions(network, SITES, 0.98)
+    change = schedule.hosting_directions(network, SITES, 0.98)
     H = np.array([20.0, 60.0, 30.0, 40.0])
-    base = powerflow.injections(network, np.array([0.5, 0.98]), {})
+    base = schedule.injections(network, np.array([0.5, 0.98]), {})
     solved = flow.solve_hours(base + np.outer(change.T @ H, d)).require()
     slope = flow.sensitivities(solved.v, change, d, solved.limited)
     held = PowerFlow(network)
@@ -188,8 +188,8 @@ def test_sensitivities_equal_central_differences_at_limits(network: Network, flo
 
 def test_sparse_and_dense_matrices_give_the_same(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
     year = profiles.ieee118().window(range(8436, 8444))
-    s = powerflow.injections(network, year.load, year.wind)
-    change = powerflow.hosting_directions(network, SITES, 0.98)
+    s = schedule.injections(network, year.load, year.wind)
+    change = schedule.hosting_directions(network, SITES, 0.98)
     results = []
     for limit in (1000, 10):
         monkeypatch.setattr(powerflow, "DENSE", limit)
@@ -216,7 +216,7 @@ def test_switched_power_flow_equals_andes(network: Network) -> None:
         )
         gc.collect()  # the pool of processes that it leaves open is told here, or in whatever test comes next
         assert system.PFlow.run()
-    injection = powerflow.injections(network, np.ones(1), {})[:, 0]
+    injection = schedule.injections(network, np.ones(1), {})[:, 0]
     demand = -injection.imag
     p = np.zeros(118)  # the schedule of the case itself
     np.add.at(p, network.generator_index, network.generators.p_set)

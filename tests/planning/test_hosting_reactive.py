@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dcvrt.grid import powerflow
+from dcvrt.grid import schedule
 from dcvrt.grid.network import Network
 from dcvrt.grid.powerflow import PowerFlow
 from dcvrt.planning import HostingProblem, profiles
@@ -23,8 +23,8 @@ def largest_alone(site: int, hour: int, limited: bool) -> float:
     """Bisection on single power flows: the largest load at a site with every voltage in 0.94-1.06."""
     year = YEAR.window([hour])
     flow = PowerFlow(NETWORK, limited)
-    base = powerflow.injections(NETWORK, year.load, year.wind)[:, 0]
-    change = powerflow.hosting_directions(NETWORK, [site], 0.98)[0] * year.dc[0]
+    base = schedule.injections(NETWORK, year.load, year.wind)[:, 0]
+    change = schedule.hosting_directions(NETWORK, [site], 0.98)[0] * year.dc[0]
 
     def good(mw: float) -> bool:
         size = abs(flow.solve(base + mw * change).v[flow.moving])

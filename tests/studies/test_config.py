@@ -89,8 +89,8 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
         "sampling, surrogate, frontier, system_limit, replay, run, "
         "fault, ... (14 in all).\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
-        "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, t_end_s, "
-        "step_s, redispatch.\n"
+        "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, coupling, "
+        "t_end_s, step_s, redispatch.\n"
         "  hosting.pf = 1.2: must be at most 1.\n"
         "  sampling.n = 3.5: must be a whole number.\n"
         "  fault[1].t_clear_ms = -5.0: must be above 0.\n"
@@ -287,6 +287,16 @@ def test_fields_that_contradict_each_other() -> None:
         "  period[3].hour = 9000: is not among the 8760 operating hours (0 to 8759).",
         f"  facility.modes: no variant 'gfn'. Did you mean 'gfm'? Known: {', '.join(facility.names())}.",
     ]
+
+
+def test_closed_loop_with_an_engine_that_has_no_facilities() -> None:
+    text = changed(
+        ('engine = "native"  ', 'engine = "andes"  '), ('coupling = "open"  ', 'coupling = "closed"  ')
+    )
+    assert complaint(text).splitlines()[1] == (
+        "  grid.coupling = 'closed': grid.engine = 'andes' has no model of a facility. Way out: "
+        "grid.engine = 'native', or coupling = 'open'."
+    )
 
 
 def test_derivatives_of_an_engine_that_has_none() -> None:

@@ -41,6 +41,7 @@ class GroupStruct(Structure):
                 "ports", "v_rows", "first_port", "first_state", "reads_v", "angle",
             )
         ),
+        ("tolerance", c_double),
         *((name, DOUBLES) for name in ("p", "moving_seed", "held", "inertia")),
         *((name, DOUBLES) for name in ("q", "entry", "entries", "since", "sinces")), ("along", c_long),
         *((name, DOUBLES) for name in ("kept", "kept_columns", "no_columns")),
@@ -136,7 +137,8 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    files = _files("fleet.h", "network.c")
+    headers = ("fleet.h", "pair.h", "run.h", "voltages.h", "steps.h", "events.h")
+    files = _files(*headers, "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
     dll.fleet_run.argtypes = [

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, raise_all
+from dcvrt.errors import InputError, did_you_mean, raise_all
 from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
@@ -29,7 +29,12 @@ from dcvrt.models.machines import UnitBlock, alone, setpoints
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
-QUANTITY = re.compile(r"(?:(?P<kind>H|wind)_(?P<bus>\d+)|(?P<whole>load|clear))")
+RATING = "beta"
+"""Parameter that rates the converter of a facility; the same at all sites where it is a quantity."""
+SEEN_OF_A_FACILITY = 3.0
+"""How much coarser the states of a facility may be than those of machines: the network sees of them the
+current, times size and impedance at the bus, 0.3 pu and less, so that voltages stay as exact."""
+QUANTITY = re.compile(r"(?:(?P<kind>H|wind)_(?P<bus>\d+)|(?P<whole>load|clear|beta))")
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Theta:
     Parameters
     ----------
     name : str
-        As tangents are called: `H_21`, `wind_69`, `load`, `clear`.
+        As tangents are called: `H_21`, `wind_69`, `load`, `clear`, `beta`.
     kind : str
     bus : int, optional
     """
@@ -67,7 +72,7 @@ def thetas(wrt: Sequence[str], sites: Sequence[int], network: Network) -> tuple[
             problems.append(
                 f"wrt: {name!r} is not known. It takes H (all sites), H_<bus>, wind_<bus>, load "
                 "(factor on every "
-                "load) and clear (s)."
+                "load), clear (s) and beta (rating of the facilities)."
             )
             continue
         bus = None if match["bus"] is None else int(match["bus"])
@@ -142,15 +147,16 @@ class Engine:
         period: Period,
         wrt: Sequence[Theta] = (),
         facilities: Mapping[int, Diagram | Dae] | None = None,
+        values: Mapping[str, float] | None = None,
     ) -> NativePoint:
-        """Solve and initialise an operating point.
+        """Solve and initialise an operating point; the arguments are those of `Grid.waveforms`.
 
         Raises
         ------
         SimulationError, InfeasibleError
             When there is no power flow or no equilibrium.
         """
-        network, coupled = self.network, self._coupled(hosting, period, facilities or {})
+        network, coupled = self.network, self._coupled(hosting, period, wrt, facilities or {}, values or {})
         own = {unit.bus for group in coupled for unit in group.units}
         scale = period.dc_factor * self.per_hosted
         hosted = {bus: 0j if bus in own else scale * hosting.get(bus, 0.0) for bus in self.sites}
@@ -171,12 +177,10 @@ class Engine:
                 load, changes = load - power, changes - moved
             else:
                 fed[kind] = power, moved
-        sizes = np.zeros((sum(len(group.units) for group in coupled), len(wrt)))
-        for row, unit in enumerate(unit for group in coupled for unit in group.units):
-            sizes[row] = [(q.kind == "H" and q.bus == unit.bus) / network.base_mva for q in wrt]
+        varied = [self._varied(group, wrt) for group in coupled]
         where = f"{network.name}, {period.name}"
         system = self._system(tuple(self._devices(fed)), coupled)
-        return NativePoint(system, load, changes, fed, sizes, self.rule, self.reactive_limits, where)
+        return NativePoint(system, load, changes, fed, varied, self.rule, self.reactive_limits, where)
 
     def _system(self, devices: tuple[Group, ...], coupled: tuple[Group, ...]) -> System:
         return self.system.joined_by(devices, coupled) if devices or coupled else self.system
@@ -198,21 +202,48 @@ class Engine:
     def _of_devices(self) -> dict[str, Structure]:
         return {}
 
+    def _varied(self, group: Group, wrt: Sequence[Theta]) -> Floats:
+        """Derivatives (units, varied, quantities) of sizes and ratings of facilities."""
+        names = group.structure.varied
+        moved = np.zeros((len(group.units), len(names), len(wrt)))
+        for k, quantity in enumerate(wrt):
+            if quantity.kind == "H":
+                own = [unit.bus == quantity.bus for unit in group.units]
+                moved[own, names.index(SCALE), k] = 1.0 / self.network.base_mva
+            elif quantity.kind == RATING and RATING in names:
+                moved[:, names.index(RATING), k] = 1.0
+        return moved
+
     def _coupled(
-        self, hosting: Mapping[int, float], period: Period, facilities: Mapping[int, Diagram | Dae]
+        self,
+        hosting: Mapping[int, float],
+        period: Period,
+        wrt: Sequence[Theta],
+        facilities: Mapping[int, Diagram | Dae],
+        values: Mapping[str, float],
     ) -> tuple[Group, ...]:
-        """Facilities as units, those of one diagram together; a site that hosts nothing has none."""
+        """Facilities as units, those of one diagram together; a site that hosts nothing has none, unless its
+        first megawatt is asked about."""
+        asked = {quantity.bus for quantity in wrt if quantity.kind == "H"}
         alike: dict[int, list[int]] = {}
         for bus, facility in facilities.items():
-            if hosting.get(bus, 0.0) > 0:
+            if hosting.get(bus, 0.0) > 0 or bus in asked:
                 alike.setdefault(id(facility), []).append(bus)
         pf = float(np.cos(np.angle(self.per_hosted)))
-        given = {"H": 1.0, "d": period.dc_factor, "pf": pf}
+        given = {"H": 1.0, "d": period.dc_factor, "pf": pf, **values}
         made = []
         for buses in alike.values():
             facility = facilities[buses[0]]
             structure = self._structure_of(facility)
-            known = {path: value for path, value in given.items() if path in structure.dae.p_names}
+            names = structure.dae.p_names
+            wanted = [*values, *(RATING for quantity in wrt if quantity.kind == RATING)]
+            for path in wanted:
+                if path not in names:
+                    raise InputError(
+                        f"{self.network.name}: facility {facility.name} at bus {buses[0]} has no parameter "
+                        f"{path!r}.{did_you_mean(path, names)}"
+                    )
+            known = {path: value for path, value in given.items() if path in names}
             try:
                 structure.dae.parameter_values(**known)
             except InputError as error:
@@ -221,19 +252,29 @@ class Engine:
                     f"cannot run there: {error} Way out: another dc_factor or pf, or no facility at this bus."
                 ) from None
             units = [
-                Unit(f"facility {facility.name}", bus, known | {SCALE: hosting[bus] / self.network.base_mva})
+                Unit(
+                    f"facility {facility.name}",
+                    bus,
+                    known | {SCALE: hosting.get(bus, 0.0) / self.network.base_mva},
+                )
                 for bus in buses
             ]
-            made.append(Group(structure, units))
+            made.append(Group(structure, units, tolerance=SEEN_OF_A_FACILITY))
         return tuple(made)
 
     def _structure_of(self, facility: Diagram | Dae) -> Structure:
         """What the network sees of a facility; kept for a compiled one, which can't change."""
         if isinstance(facility, Diagram):
-            return Structure(facility.compile(), "v_poi", "i", -1.0, sized=True)
+            return self._seen(facility.compile())
         if facility not in self._structures:
-            self._structures[facility] = Structure(facility, "v_poi", "i", -1.0, sized=True)
+            self._structures[facility] = self._seen(facility)
         return self._structures[facility]
+
+    @staticmethod
+    def _seen(dae: Dae) -> Structure:
+        return Structure(
+            dae, "v_poi", "i", -1.0, varied=(SCALE, RATING) if RATING in dae.p_names else (SCALE,)
+        )
 
     @cached_property
     def _structures(self) -> WeakKeyDictionary[Dae, Structure]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import SimulationError
-from dcvrt.grid.native.structure import Structure
+from dcvrt.grid.native.structure import Structure, for_units
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -23,7 +23,8 @@ STEPS = 40
 AT_REST = 1e-8
 """Guard, of rates at rest, that counts as zero."""
 ON_LIMIT = 1e-4
-"""Distance beyond a limit, pu, at which a unit may start: data in four digits leave so much."""
+"""Distance beyond a limit, pu, at which a unit may start and counts as on it: data in four digits leave so
+much. Both engines tell of it."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,14 @@ class Group:
     power : str
         Whose power at the bus they feed in: that of its `generation`, of its (negative) `load`, of its
         `wind`.
+    tolerance : float
+        Error of its states in a run, over that of the run's options.
     """
 
     structure: Structure
     units: Sequence[Unit]
     power: str = "generation"
+    tolerance: float = 1.0
 
     @cached_property
     def p(self) -> Floats:
@@ -83,12 +87,12 @@ class Group:
         x = np.tile([row.value for row in self.structure.dae.states], (len(p), 1))
         v = np.tile([1.0, 0.0], (len(p), 1))
         slopes = self._slopes(x, v, p)
-        mean = 0.5 * np.stack([slopes[0, :, 0] + slopes[1, :, 1], slopes[1, :, 0] - slopes[0, :, 1]], axis=1)
+        mean = 0.5 * np.stack([slopes[:, 0, 0] + slopes[:, 1, 1], slopes[:, 1, 0] - slopes[:, 0, 1]], axis=1)
         return np.where(np.isfinite(mean), -mean, 0.0)
 
     def _slopes(self, x: Floats, v: Floats, p: Floats) -> Floats:
-        """di/dv as (2, units, 2)."""
-        return np.array(self.structure.slopes.map(len(p))(x.T, v.T, p.T)).reshape(2, len(p), 2)
+        """di/dv as (units, 2, 2)."""
+        return for_units(self.structure.slopes, x, v, p)[0]
 
     def shunts(self) -> Phasors:
         """Admittance that the network holds for each unit."""
@@ -96,16 +100,13 @@ class Group:
             return self.p[:, -2] + 1j * self.p[:, -1]
         n = len(self.units)
         slopes = self._slopes(np.zeros((n, self.structure.dae.x.numel())), np.zeros((n, 2)), self.p)
-        return -(slopes[0, :, 0] + 1j * slopes[1, :, 0])
+        return -(slopes[:, 0, 0] + 1j * slopes[:, 1, 0])
 
     def held(self, p: Floats) -> Floats:
         """Dwell times (units, rows), s."""
-        rows = len(self.structure.rows)
-        return (
-            np.array(self.structure.held.map(len(p))(p.T)).reshape(rows, len(p)).T
-            if rows
-            else np.zeros((len(p), 0))
-        )
+        if not self.structure.rows:
+            return np.zeros((len(p), 0))
+        return for_units(self.structure.held, p)[0][:, :, 0]
 
     def equilibrium(self, v: Phasors, i: Phasors, where: str) -> Equilibrium:
         """States and set-points at rest, for given terminal voltages and currents into the network.
@@ -116,44 +117,40 @@ class Group:
             When there is none for some unit, with its largest residuals by name; when a limit is exceeded.
         """
         s, n = self.structure, len(self.units)
-        p, columns, nx = self.p.copy(), [s.column(path) for path in s.setpoints], s.dae.x.numel()
-        size = nx + len(columns)
-        volts, current = np.vstack([v.real, v.imag]), np.vstack([i.real, i.imag])
-        x = np.array(s.start.map(n)(volts, p.T)).reshape(nx, n).T.copy()
+        columns, nx = [s.column(path) for path in s.setpoints], s.dae.x.numel()
+        volts, current = (np.stack([a.real, a.imag], axis=1) for a in (v, i))
+        p, x = self.p.copy(), for_units(s.start, volts, self.p)[0][:, :, 0].copy()
         if s.angle:  # the rest is nearly linear once the q-axis is known
             x[:, s.dae.x_names.index(s.angle)] = np.angle(v + 1j * p[:, s.column(s.reactance)] * i)
-        balance = s.balance.map(n)
         last = np.full(n, np.inf)
         for step in range(STEPS + 1):
-            residual, jacobian = (np.array(a) for a in balance(x.T, volts, p.T, current))
-            r, j = residual.T, jacobian.reshape(size, n, size).transpose(1, 0, 2)
+            r, j = for_units(s.balance, x, volts, p, current)
+            r = r[:, :, 0]
             level = np.abs(r).max(axis=1, initial=0.0)
             stalled = step > 3 and bool((level < ACCEPTED).all() and (level >= 0.5 * last).all())
             if (level < TOLERANCE).all() or stalled or not np.isfinite(r).all() or step == STEPS:
                 break
             last = level
             try:
-                move = self._inverse(j) @ r[:, :, None]
+                move = self._solve(j, r[:, :, None])
             except np.linalg.LinAlgError:  # singular: told below, by the residuals that are left
                 break
             x -= move[:, :nx, 0]
             p[:, columns] -= move[:, nx:, 0]
         self._check(r, where)
-        found = s.at_rest.map(n)(x.T, volts, p.T, current)
-        by_v, guards, moves, now, slopes = (np.array(a) for a in found)
-        if s.setpoints:
-            self._check_limits(guards.reshape(-1, n).T, moves.reshape(-1, n).T, where)
+        by_given, guards, moves, now, slopes = for_units(s.at_rest, x, volts, p, current)
+        notes = self._check_limits(guards[:, :, 0], moves[:, :, 0], where) if s.setpoints else ()
         return Equilibrium(
-            self, x, p, self._inverse(j), by_v.reshape(size, n, 2).transpose(1, 0, 2), now[0] + 1j * now[1],
-            slopes.reshape(2, n, size + 2).transpose(1, 0, 2), float(level.max(initial=0.0)),
+            self, x, p, j, by_given, now[:, 0, 0] + 1j * now[:, 1, 0], slopes,
+            float(level.max(initial=0.0)), notes,
         )  # fmt: skip
 
-    def _inverse(self, jacobian: Floats) -> Floats:
-        """Inverse Jacobians. A unit without set-points may rest anywhere along some direction, as a battery
-        does at any charge: it stays where it starts."""
+    def _solve(self, jacobian: Floats, right: Floats) -> Floats:
+        """Change of the unknowns. A unit without set-points may rest anywhere along some direction, as a
+        battery does at any charge: it stays where it starts."""
         if self.structure.setpoints:
-            return np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
-        return np.asarray(np.linalg.pinv(jacobian, rcond=1e-11), dtype=np.float64)
+            return np.asarray(np.linalg.solve(jacobian, right), dtype=np.float64)
+        return np.asarray(np.linalg.pinv(jacobian, rcond=1e-11) @ right, dtype=np.float64)
 
     def _check(self, residual: Floats, where: str) -> None:
         worst = np.nan_to_num(np.abs(residual), nan=np.inf).max(axis=1, initial=0.0)
@@ -170,22 +167,24 @@ class Group:
             f"{self.units[k].bus}: {named}. Way out: host less, or check its data."
         )
 
-    def _check_limits(self, guards: Floats, moves: Floats, where: str) -> None:
-        """Refuse a start outside a limit.
+    def _check_limits(self, guards: Floats, moves: Floats, where: str) -> tuple[str, ...]:
+        """Refuse a start outside a limit; a sentence for each that counts as on it.
 
         At rest nothing pushes, so the guard of a limit that also asks for that is zero to rounding; how far
         the limit is exceeded is then how far its row would move the state.
         """
         rows, automata = self.structure.rows, self.structure.dae.automata
-        broken = []
+        broken, notes = [], []
         beyond = np.maximum(guards[:, : len(rows)], moves)
         for r, (a, row) in enumerate(rows):
             if row.source != automata[a].start:
                 continue
-            broken += [
-                f"{self.units[k].name} at bus {self.units[k].bus}: {automata[a].path}, {row.text}"
-                for k in np.flatnonzero((guards[:, r] > -AT_REST) & (beyond[:, r] > ON_LIMIT)).tolist()
-            ]
+            for k in np.flatnonzero((guards[:, r] > -AT_REST) & (beyond[:, r] > AT_REST)).tolist():
+                text = f"{self.units[k].name} at bus {self.units[k].bus}: {automata[a].path}, {row.text}"
+                if beyond[k, r] > ON_LIMIT:
+                    broken.append(text)
+                else:
+                    notes.append(f"{text} by {beyond[k, r]:.1g} pu")
         states = self.structure.dae.states
         for b, (state, _, bound) in enumerate(self.structure.bounds):
             broken += [
@@ -199,6 +198,7 @@ class Group:
                 f"{'; '.join(broken[:4])}{more}. "
                 "Way out: host less, or give the unit a wider limit."
             )
+        return tuple(notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,29 +210,38 @@ class Equilibrium:
     group : Group
     x : array (units, states)
     p : array (units, parameters)
-    inverse : array (units, n, n)
-        Of the Jacobian of the residuals by states and set-points.
-    by_v : array (units, n, 2)
-        Jacobian of the residuals by the terminal voltage.
+    jacobian : array (units, n, n)
+        Of the residuals by states and set-points.
+    by_given : array (units, n, 2 + varied)
+        Jacobian of the residuals by the terminal voltage and the parameters that are varied.
     current : complex array (units,)
         Into the network.
-    slopes : array (units, 2, n + 2)
-        Of the current by states and set-points, then by the voltage.
+    slopes : array (units, 2, n + 2 + varied)
+        Of the current by states and set-points, then by the voltage and the parameters that are varied.
     residual : float
         Largest residual left.
+    notes : tuple of str
+        Units that start beyond a limit by so little that they count as on it.
     """
 
     group: Group
     x: Floats
     p: Floats
-    inverse: Floats
-    by_v: Floats
+    jacobian: Floats
+    by_given: Floats
     current: Phasors
     slopes: Floats
     residual: float
+    notes: tuple[str, ...]
 
-    def derivatives(self, dv: Phasors, di: Phasors) -> tuple[Floats, Floats]:
+    def derivatives(self, dv: Phasors, di: Phasors, dvaried: Floats | None = None) -> tuple[Floats, Floats]:
         """Derivatives of states and set-points, for those of terminal voltages and currents (units, thetas).
+
+        Parameters
+        ----------
+        dv, di : complex arrays (units, thetas)
+        dvaried : array (units, varied, thetas), optional
+            Derivatives of the parameters that are varied; they stand still when not given.
 
         Returns
         -------
@@ -240,15 +249,20 @@ class Equilibrium:
         dsetpoints : array (units, set-points, thetas)
         """
         nx = self.x.shape[1]
-        right = self.by_v @ np.stack([dv.real, dv.imag], axis=1)
+        right = self.by_given @ self._given(dv, dvaried)
         if self.group.structure.setpoints:
             right[:, nx:] -= np.stack([di.real, di.imag], axis=1)
-        moved = -self.inverse @ right
+        moved = -self.group._solve(self.jacobian, right)
         return moved[:, :nx], moved[:, nx:]
 
-    def current_by_v(self, dv: Phasors) -> Phasors:
-        """Derivative of the current at rest, for those of terminal voltages (units, thetas)."""
-        moved, _ = self.derivatives(dv, np.zeros_like(dv))
-        volts = np.stack([dv.real, dv.imag], axis=1)
-        parts = self.slopes @ np.concatenate([moved, volts], axis=1)
+    def current_derivative(self, dv: Phasors, dvaried: Floats) -> Phasors:
+        """Derivative of the current at rest (units, thetas); arguments as those of `derivatives`."""
+        moved, _ = self.derivatives(dv, np.zeros_like(dv), dvaried)
+        parts = self.slopes @ np.concatenate([moved, self._given(dv, dvaried)], axis=1)
         return parts[:, 0] + 1j * parts[:, 1]
+
+    def _given(self, dv: Phasors, dvaried: Floats | None) -> Floats:
+        still = np.zeros((len(dv), len(self.group.structure.varied), dv.shape[1]))
+        return np.concatenate(
+            [dv.real[:, None], dv.imag[:, None], still if dvaried is None else dvaried], axis=1
+        )

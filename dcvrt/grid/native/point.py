@@ -18,8 +18,7 @@ from dcvrt.grid.native.build import unit_objects
 from dcvrt.grid.native.fleet import Equilibrium, Group
 from dcvrt.grid.native.ports import Ports
 from dcvrt.grid.native.run import Fleet, Layout, NetworkTable, Options, Simulated, simulate
-from dcvrt.grid.native.steady import Flow
-from dcvrt.grid.native.structure import SCALE
+from dcvrt.grid.native.steady import Flow, Steady
 from dcvrt.grid.network import Network
 
 Floats = npt.NDArray[np.float64]
@@ -101,8 +100,8 @@ class NativePoint:
         What the buses take as impedances, pu, and its derivatives.
     fed : mapping of `Group.power` to pair of such arrays
         Power that other units than generators feed in, and its derivatives.
-    dscale : array (facilities, parameters)
-        Derivatives of the sizes of the facilities, counted through their groups, over the base of the system.
+    dvaried : sequence of arrays (units, varied, parameters)
+        Derivatives of what is varied of the facilities, of each of their groups.
     rule : str
         How the units share the change of load.
     reactive_limits : bool
@@ -121,7 +120,7 @@ class NativePoint:
         load: Phasors,
         dload: Phasors,
         fed: Mapping[str, tuple[Phasors, Phasors]],
-        dscale: Floats,
+        dvaried: Sequence[Floats],
         rule: str,
         reactive_limits: bool,
         where: str,
@@ -129,7 +128,7 @@ class NativePoint:
         self.system, self.where, self._load, self._dload = system, where, load, dload
         taken = load - sum((power for power, _ in fed.values()), np.zeros_like(load))
         coupled = self._power_flow(taken, rule, reactive_limits)
-        self._derivatives(dload - sum((d for _, d in fed.values()), np.zeros_like(dload)), coupled, dscale)
+        self._derivatives(dload - sum((d for _, d in fed.values()), np.zeros_like(dload)), coupled, dvaried)
         powers = {**fed, "generation": (self.steady.generation, self._dgeneration)}
         first = 0
         self.rest: list[Equilibrium] = []
@@ -144,16 +143,14 @@ class NativePoint:
             self.rest.append(rest)
             self._dx.append(dx)
             self._dset.append(dset)
-        seen = 0
-        for rest in coupled:
+        for rest, moves in zip(coupled, dvaried, strict=True):
             n = len(rest.group.units)
             own = system.unit_bus[first : first + n]
             first += n
-            dx, _ = rest.derivatives(self._dv[own], np.zeros((n, dload.shape[1]), dtype=complex))
+            dx, _ = rest.derivatives(self._dv[own], np.zeros((n, dload.shape[1]), dtype=complex), moves)
             self.rest.append(rest)
             self._dx.append(dx)
-            self._dset.append(dscale[seen : seen + n, None, :])
-            seen += n
+            self._dset.append(moves)
 
     def _power_flow(self, load: Phasors, rule: str, reactive_limits: bool) -> list[Equilibrium]:
         """Solve it with the power that the facilities draw at rest at the voltages that it gives."""
@@ -161,6 +158,7 @@ class NativePoint:
         at = system.unit_bus[sum(len(g.units) for g in system.groups) :]
         v = np.ones(len(load), dtype=complex)
         drawn = np.zeros(len(at), dtype=complex)
+        steady: Steady | None = None
         for _ in range(ROUNDS):
             fed, first = [], 0
             for group in system.facilities:
@@ -171,10 +169,10 @@ class NativePoint:
             drawn = np.concatenate([*(-v[g] * f.current.conj() for g, f in self._at(fed, at)), np.zeros(0)])
             total = load.copy()
             np.add.at(total, at, drawn)
-            if len(at) and np.abs(drawn - before).max() < AGREED:
+            if steady is not None and np.abs(drawn - before).max() < AGREED:
                 return fed
-            self.steady = system.flow.solve(total, rule, reactive_limits, self.where)
-            v = self.steady.v
+            self.steady = steady = system.flow.solve(total, rule, reactive_limits, self.where, steady)
+            v = steady.v
             if not len(at):
                 return fed
         raise SimulationError(
@@ -188,23 +186,19 @@ class NativePoint:
         ends = np.cumsum([0, *(len(rest.group.units) for rest in fed)])
         return [(at[a:b], rest) for a, b, rest in zip(ends, ends[1:], fed, strict=False)]
 
-    def _derivatives(self, taken: Phasors, fed: Sequence[Equilibrium], dscale: Floats) -> None:
+    def _derivatives(self, taken: Phasors, fed: Sequence[Equilibrium], dvaried: Sequence[Floats]) -> None:
         """Derivatives of voltages and generation; what facilities draw follows the voltage."""
         d = self._dload.shape[1]
         self._dv = self._dgeneration = np.zeros((len(self.v0), d), dtype=complex)
         if not d:
             return
         at = self.system.unit_bus[sum(len(g.units) for g in self.system.groups) :]
-        scale = np.concatenate([*(r.p[:, r.group.structure.column(SCALE)] for r in fed), np.zeros(0)])
         for _ in range(ROUNDS):
             dload, before = taken.copy(), self._dv
-            first = 0
-            for own, rest in self._at(fed, at):
+            for (own, rest), moves in zip(self._at(fed, at), dvaried, strict=True):
                 v, dv, i = self.v0[own, None], before[own], rest.current[:, None]
-                per_scale = np.divide(1.0, scale[first : first + len(own)])[:, None]
-                di = rest.current_by_v(dv) + i * per_scale * dscale[first : first + len(own)]
+                di = rest.current_derivative(dv, moves)
                 np.add.at(dload, own, -(dv * i.conj() + v * di.conj()))
-                first += len(own)
             self._dv, self._dgeneration = self.steady.derivatives(dload)
             if np.abs(self._dv - before).max() <= 1e-12 * np.abs(self._dv).max():
                 return
@@ -231,6 +225,11 @@ class NativePoint:
     def residual(self) -> float:
         """Largest residual of the equilibrium."""
         return max((rest.residual for rest in self.rest), default=0.0)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Units that start beyond a limit by so little that they count as on it."""
+        return tuple(note for rest in self.rest for note in rest.notes)
 
     @cached_property
     def fleet(self) -> Fleet:

@@ -151,7 +151,7 @@ class NetworkTable:
 def _blocks(z: Phasors) -> Floats:
     rows, columns = z.shape
     blocks = z.reshape(rows // BLOCK, BLOCK, columns).transpose(0, 2, 1)
-    return np.ascontiguousarray(np.stack([blocks.real, blocks.imag], axis=2))
+    return _aligned(np.stack([blocks.real, blocks.imag], axis=2))  # type: ignore[return-value]
 
 
 class Fleet:
@@ -238,6 +238,7 @@ class Fleet:
             fixed_columns=obj.fixed_columns,
             ports=ports, v_rows=rows, first_port=port, first_state=state, reads_v=int(not structure.affine),
             angle=dae.x_names.index(structure.angle) if structure.angle else -1,
+            tolerance=group.tolerance,
             p=doubles(self.layout.in_lanes(eq.p, packs)),
             moving_seed=doubles(self.layout.in_lanes(seeds, packs)),
             held=doubles(self.layout.in_lanes(held, packs)), inertia=doubles(mass),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ import scipy.sparse.linalg as spla
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import redispatch
 from dcvrt.grid.network import Network
+from dcvrt.grid.switching import LOOKS, Limited, reactive_limits_at, switched
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -28,11 +30,7 @@ Phasors = npt.NDArray[np.complex128]
 TOLERANCE = 1e-11
 """Largest mismatch of a solution, pu."""
 ACCEPTED = 1e-9
-LIMIT_SLACK = 1e-9
-"""Reactive power beyond a limit, pu, that counts as on it."""
 STEPS = 30
-ROUNDS = 20
-"""Most exchanges between held voltages and reactive limits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +59,12 @@ class Steady:
     at_limit: tuple[int, ...]
     iterations: int
     _equations: Equations
-    _factors: spla.SuperLU
+    _share: Floats
+
+    @cached_property
+    def _factors(self) -> spla.SuperLU:
+        current = np.asarray(self._equations.y @ self.v, dtype=np.complex128)
+        return spla.splu(self._equations.jacobian(self.v, current, self._share))
 
     def derivatives(self, load: Phasors) -> tuple[Phasors, Phasors]:
         """Derivatives of voltages and generation by parameters that change the load.
@@ -91,18 +94,18 @@ class Equations:
     """Mismatch and Jacobian of one network with given held voltages; the pattern is laid out once.
 
     Unknowns are the angles of `free`, the magnitudes of `pq` and the total; rows are P of `free`, Q of `pq`
-    and P of the slack bus.
+    and P of the slack bus. The slack bus keeps its angle; its voltage may be let go like any other.
     """
 
-    def __init__(self, network: Network, kind: npt.NDArray[np.str_]) -> None:
-        self.pq = np.flatnonzero(kind == "pq")
-        self.free = np.r_[np.flatnonzero(kind == "pv"), self.pq]
+    def __init__(self, network: Network, held: npt.NDArray[np.bool_]) -> None:
         self.slack = network.slack
+        self.pq = np.flatnonzero(~held)
+        self.free = np.flatnonzero(np.arange(len(held)) != self.slack)
         self.y = network.admittance()
-        y = (self.y + sp.eye(len(kind)) * 0.0).tocoo()  # with every diagonal entry
+        y = (self.y + sp.eye(len(held)) * 0.0).tocoo()  # with every diagonal entry
         self._i, self._j, self._values = y.row, y.col, y.data
         self._diagonal = np.flatnonzero(y.row == y.col)
-        n, m, size = len(self.free), len(self.pq), len(kind)
+        n, m, size = len(self.free), len(self.pq), len(held)
         p_row, q_row = np.full(size, -1), np.full(size, -1)
         angle, magnitude = np.full(size, -1), np.full(size, -1)
         p_row[np.r_[self.free, self.slack]] = np.r_[np.arange(n), n + m]
@@ -172,16 +175,24 @@ class Flow:
                 "a bus. Way out: join them into one unit, or engine='andes'."
             )
         self._equations: dict[bytes, Equations] = {}
+        self.holding = np.flatnonzero(np.array(network.kind) != "pq")
+        """Buses whose units hold the voltage, the slack bus among them."""
+        self.q_low, self.q_high = reactive_limits_at(network, self.holding)
 
-    def equations(self, kind: npt.NDArray[np.str_]) -> Equations:
+    def equations(self, held: npt.NDArray[np.bool_]) -> Equations:
         """Equations with these held voltages."""
-        key = kind.tobytes()
+        key = held.tobytes()
         if key not in self._equations:
-            self._equations[key] = Equations(self.network, kind)
+            self._equations[key] = Equations(self.network, held)
         return self._equations[key]
 
     def solve(
-        self, load: Phasors, rule: str = "proportional", reactive_limits: bool = False, where: str = ""
+        self,
+        load: Phasors,
+        rule: str = "proportional",
+        reactive_limits: bool = False,
+        where: str = "",
+        near: Steady | None = None,
     ) -> Steady:
         """Solve for one load.
 
@@ -192,9 +203,12 @@ class Flow:
         rule : str
             Who supplies a change of load, one of `redispatch.RULES`.
         reactive_limits : bool
-            Whether a unit whose reactive power would leave its limits holds the limit instead of the voltage.
+            Whether a unit whose reactive power would leave its limits holds the limit instead of the voltage,
+            that of the slack bus too.
         where : str
             What messages call the operating point.
+        near : Steady, optional
+            Where the search begins; at the held voltages when not given.
 
         Raises
         ------
@@ -205,39 +219,28 @@ class Flow:
             When the units cannot supply the load.
         """
         network, where = self.network, where or self.network.name
-        kind = np.array(network.kind)
-        q_fixed, v = np.zeros(len(kind)), network.v_set * np.exp(1j * network.slack_angle)
-        found = self._newton(load, kind, q_fixed, rule, v, where)
-        if reactive_limits:
-            found = self._with_limits(load, kind, q_fixed, rule, found, where)
+        limited, v_set = np.zeros(len(self.holding), dtype=np.int8), network.v_set[self.holding]
+        v = network.v_set * np.exp(1j * network.slack_angle) if near is None else near.v
+        for look in range(LOOKS):
+            keep = self.holding[limited == 0]
+            v = v.copy()
+            v[keep] *= network.v_set[keep] / abs(v[keep])
+            found = self._newton(load, limited, rule, v, where)
+            if not reactive_limits:
+                break
+            v = found.v
+            q, size = found.generation[self.holding].imag, np.abs(v[self.holding])
+            now = switched(limited, q, size, v_set, self.q_low, self.q_high, back=look < LOOKS // 2)
+            if (now == limited).all():
+                break
+            limited = now
+        else:
+            raise SimulationError(
+                f"{where}: units exchanged voltage and reactive limits {LOOKS} times without settling. Way "
+                "out: reactive_limits=False, or check q_min and q_max."
+            )
         self._check_slack(found, where)
         return found
-
-    def _with_limits(
-        self, load: Phasors, kind: npt.NDArray[np.str_], q_fixed: Floats, rule: str, found: Steady, where: str
-    ) -> Steady:
-        """Exchange held voltages for reactive limits, and back, until every unit is consistent."""
-        network, units = self.network, self.network.generators
-        at, v_set = network.generator_index, network.v_set
-        low, high = np.full(len(kind), -np.inf), np.full(len(kind), np.inf)
-        low[at], high[at] = units.q_min / network.base_mva, units.q_max / network.base_mva
-        for _ in range(ROUNDS):
-            q, size = found.generation.imag, abs(found.v)
-            over = (kind == "pv") & ((q > high + LIMIT_SLACK) | (q < low - LIMIT_SLACK))
-            let_go = (kind == "pq") & (np.array(network.kind) == "pv")
-            # at its upper limit a unit has let the voltage sag; once it is above the set point, it holds it
-            # again
-            back = let_go & (((q_fixed == high) & (size > v_set)) | ((q_fixed == low) & (size < v_set)))
-            if not over.any() and not back.any():
-                return found
-            kind[over], q_fixed[over] = "pq", np.clip(q, low, high)[over]
-            kind[back], q_fixed[back] = "pv", 0.0
-            start = np.where(kind == "pv", v_set / size, 1.0) * found.v
-            found = self._newton(load, kind, q_fixed, rule, start, where)
-        raise SimulationError(
-            f"{where}: units exchanged voltage and reactive limits {ROUNDS} times without settling. Way out: "
-            "reactive_limits=False, or check q_min and q_max."
-        )
 
     def _check_slack(self, found: Steady, where: str) -> None:
         network = self.network
@@ -253,13 +256,16 @@ class Flow:
     def _newton(
         self,
         load: Phasors,
-        kind: npt.NDArray[np.str_],
-        q_fixed: Floats,
+        limited: Limited,
         rule: str,
         start: Phasors,
         where: str,
     ) -> Steady:
-        network, equations = self.network, self.equations(kind)
+        network = self.network
+        held, q_fixed = np.zeros(len(load), dtype=bool), np.zeros(len(load))
+        held[self.holding] = limited == 0
+        q_fixed[self.holding] = np.select([limited > 0, limited < 0], [self.q_high, self.q_low], 0.0)
+        equations = self.equations(held)
         at, slack, y = network.generator_index, network.slack, equations.y
         base = network.base_mva
         p_set, p_max = network.generators.p_set / base, network.generators.p_max / base
@@ -296,7 +302,7 @@ class Flow:
                 "load_scale and the "
                 "voltage set points."
             )
-        let_go = np.flatnonzero((kind == "pq") & (np.array(network.kind) != "pq"))
+        let_go = self.holding[limited != 0]
         return Steady(
             v,
             v * current.conj() + load,
@@ -305,7 +311,7 @@ class Flow:
             tuple(int(b) for b in network.bus[let_go]),
             step,
             equations,
-            spla.splu(equations.jacobian(v, current, share)),
+            share,
         )
 
 

@@ -5,14 +5,45 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from dcvrt.dae import Dae, Transition
 from dcvrt.errors import ModelError, did_you_mean
 
 SCALE = "scale"
+Floats = npt.NDArray[np.float64]
+
+
+def for_units(function: ca.Function, *values: Floats) -> list[Floats]:
+    """Results of a function of one unit, for many.
+
+    Parameters
+    ----------
+    function : Function
+        With dense results.
+    values : arrays (units, rows)
+
+    Returns
+    -------
+    list of arrays (units, rows, columns)
+    """
+    n = len(values[0])
+    shapes = [function.size_out(k) for k in range(function.n_out())]
+    given = [np.ascontiguousarray(v, dtype=np.float64) for v in values]
+    found = [np.empty((n, columns, rows)) for rows, columns in shapes]
+    # numbers pass through memory: matrices of CasADi are made of them one by one
+    buffer: Any  # its stubs take memory of integers
+    buffer, run = function.map(n).buffer()
+    for k, array in enumerate(given):
+        buffer.set_arg(k, array.reshape(-1).data)
+    for k, array in enumerate(found):
+        buffer.set_res(k, array.reshape(-1).data)
+    run()
+    return [array.transpose(0, 2, 1) for array in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +67,8 @@ class Structure:
         1 where the output flows into the network, -1 where it flows into the unit.
     setpoints : sequence of str
         Parameters that follow from the operating point, as many as the terminal's current has parts.
-    sized : bool
-        Whether the size of the unit, `SCALE`, is a quantity to differentiate by.
+    varied : sequence of str
+        Parameters to differentiate by beside the set-points; `SCALE` is the size of the unit.
     angle, inertia, reactance : str
         Of a rotor: the state that is its angle, the parameter that weighs it, and that behind which the
         q-axis lies; empty where there is none.
@@ -48,7 +79,7 @@ class Structure:
     current: str = "i"
     sign: float = 1.0
     setpoints: Sequence[str] = ()
-    sized: bool = False
+    varied: Sequence[str] = ()
     angle: str = ""
     inertia: str = ""
     reactance: str = ""
@@ -144,7 +175,7 @@ class Structure:
     @property
     def moving(self) -> tuple[str, ...]:
         """Parameters that change with the operating point: derivatives pass through them."""
-        return (*self.setpoints, *((SCALE,) if self.sized else ()))
+        return (*self.setpoints, *self.varied)
 
     def column(self, path: str) -> int:
         """Position among `p` of a parameter, or of `SCALE`."""
@@ -211,22 +242,27 @@ class Structure:
         return ca.Function("balance", given, self._at_start(made), {"cse": True})
 
     @cached_property
+    def given(self) -> ca.SX:
+        """What an equilibrium moves with: the terminal voltage, then the parameters that are varied."""
+        return ca.vertcat(self.v, *(self.p[self.column(path)] for path in self.varied))
+
+    @cached_property
     def at_rest(self) -> ca.Function:
-        """(x, v, p, current wanted) -> Jacobian of the residual by v, guards, how far each row would move its
-        states, current, its Jacobian by unknowns and v."""
+        """(x, v, p, current wanted) -> Jacobian of the residual by what is given, guards, how far each row
+        would move its states, current, its Jacobian by what is unknown and given."""
         moves = [
             sum((ca.fabs(value - self.dae.x[state]) for state, value in row.reset.items()), ca.SX(0))
             for _, row in self.rows
         ]
         made = [
-            ca.densify(ca.jacobian(self._residual, self.v)),
+            ca.densify(ca.jacobian(self._residual, self.given)),
             ca.densify(self.guards),
             ca.densify(ca.vertcat(ca.SX(0, 1), *moves)),
             self.i,
-            ca.densify(ca.jacobian(self.i, ca.vertcat(self.unknown, self.v))),
+            ca.densify(ca.jacobian(self.i, ca.vertcat(self.unknown, self.given))),
         ]
-        given = [self.dae.x, self.v, self.p, self._wanted]
-        return ca.Function("at_rest", given, self._at_start(made), {"cse": True})
+        at = [self.dae.x, self.v, self.p, self._wanted]
+        return ca.Function("at_rest", at, self._at_start(made), {"cse": True})
 
     @cached_property
     def start(self) -> ca.Function:

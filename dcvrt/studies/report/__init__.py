@@ -14,6 +14,7 @@ from dcvrt.studies.outputs import write_atomically
 from dcvrt.studies.report import (
     answer,
     checks,
+    coupling,
     frontier,
     grid,
     hypotheses,
@@ -34,6 +35,7 @@ SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     plans.plans,
     plans.failures,
     plans.closed_sites,
+    coupling.coupling,
     hypotheses.hypotheses,
     checks.validation,
     checks.worst_cases,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dcvrt.planning import surrogate
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.report import caveats
+from dcvrt.studies.report import caveats, coupling
 from dcvrt.studies.report.caveats import name_of
 from dcvrt.studies.report.page import Safe, bullets, escape, notice, paragraph, section
 from dcvrt.studies.report.record import failed_runs
@@ -106,6 +106,14 @@ def _warnings(findings: Findings) -> Safe:
             notice(
                 f"{len(ac)} plan(s) failed the AC power flow",
                 bullets([f"{name_of(row)}: {findings.plan(row)['ac_status']}" for row in ac]),
+            )
+        )
+    turned = coupling.turned(findings)
+    if turned:
+        boxes.append(
+            notice(
+                f"{len(turned)} plan(s) do not ride through once their facilities act on the network",
+                bullets(turned),
             )
         )
     reactive = caveats.reactive_limits(findings)

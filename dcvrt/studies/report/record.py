@@ -120,8 +120,8 @@ def provenance(findings: Findings) -> Safe:
         ),
         (
             "Files beside this report",
-            "study.toml, study.sqlite (everything), summary.json, table.csv, validation.csv, figures/ "
-            "(SVG and PNG)",
+            "study.toml, study.sqlite (everything), summary.json, table.csv, validation.csv, coupling.csv, "
+            "figures/ (SVG and PNG)",
         ),
         (
             "Again",

@@ -108,10 +108,11 @@ def run(
     facilities: Mapping[int, Diagram] | None = None,
     times: Sequence[np.ndarray] | None = None,
     step: float = 1 / 120,
+    values: Mapping[str, float] | None = None,
 ) -> tuple[np.ndarray, Simulated, NativePoint]:
     """Times, what the engine leaves, and the operating point."""
     by = thetas(wrt, of.sites, of.network)
-    point = of.point(hosting, period or Period(), by, facilities)
+    point = of.point(hosting, period or Period(), by, facilities, values)
     stages = fault.stages(of.network)
     times = times or sample_times(stages, until, step)
     moves = {len(stages) - 1: np.array([float(q.kind == "clear") for q in by])} if by else None

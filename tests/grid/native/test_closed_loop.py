@@ -10,8 +10,8 @@ import pytest
 
 from dcvrt import Simulator, Waveform, facility
 from dcvrt.grid import BusFault, Grid, Period
-from dcvrt.grid.native.engine import Engine
-from dcvrt.grid.native.run import Simulated
+from dcvrt.grid.native.engine import Engine, sample_times
+from dcvrt.grid.native.run import Options, Simulated
 from tests.grid.native.cases import NO_VRT, TIGHT, TIGHTEST, away, run
 from tests.grid.native.test_sensitivities import compare, even, same_events, with_limits
 
@@ -101,6 +101,23 @@ def test_two_facilities_of_one_diagram_and_of_two_are_the_same() -> None:
     assert np.abs(one.v - two.v).max() < 1e-9
 
 
+@pytest.mark.parametrize("name", ["gfl", "gfm"])
+def test_the_default_tolerance_keeps_voltages_and_events(grid: Grid, name: str) -> None:
+    """Facilities are allowed three times the error of machines, and step at the edge of stability."""
+    coupled = dict.fromkeys(NO_VRT, facility.get(name).compile())
+    point = grid.native.point(NO_VRT, Period(), (), coupled, {"beta": 1.3})
+    for fault in (BusFault(22), BusFault(103)):
+        stages = fault.stages(grid.network)
+        times = sample_times(stages, 3.0, 1 / 120)
+        coarse, fine = (point.simulate(stages, times, o) for o in (Options(), TIGHT))
+        assert not coarse.status
+        assert len(coarse.events) >= 4
+        assert [e[1:] for e in coarse.events] == [e[1:] for e in fine.events]
+        shift = [a[0] - b[0] for a, b in zip(coarse.events, fine.events, strict=True)]
+        assert np.abs(shift).max() < 5e-6
+        assert np.abs(coarse.v - fine.v).max() < 1e-5
+
+
 def modes(found: Simulated, around: list[Simulated]) -> None:
     own = [text for _, unit, text in found.events if unit.startswith("facility")]
     assert len(own) >= 2
@@ -123,6 +140,30 @@ def test_tangents_in_closed_loop_across_modes_and_timers(name: str, x_q2: float)
         facilities={3: diagram},
     )  # fmt: skip
     assert max(worst.values()) < 1e-6, worst
+
+
+@pytest.mark.parametrize(("name", "beta"), [("gfl", 1.3), ("gfl", 1.03), ("gfm", 1.3)])
+def test_tangents_by_the_rating(name: str, beta: float) -> None:
+    """At 1.03 the limiter stands at the edge of acting before the fault."""
+    of, diagram = small(0.25 if name == "gfl" else 0.33), facility.get(name)
+    times = even(FAULT, of, 0.9, 12)
+    of_rating = {"values": {"beta": beta}}
+    names = ("beta", "H_3")
+    worst = compare(
+        of, {3: 20.0}, Period(), FAULT, names, times, None, 0.1, facilities={3: diagram}, **of_rating
+    )
+    assert max(worst.values()) < 1e-6, worst
+
+
+def test_tangent_of_the_first_megawatt() -> None:
+    of, diagram = small(), facility.gfl()
+    times, names = even(FAULT, of, 0.6, 8), ("H_3",)
+    given = dict(times=times, facilities={3: diagram}, options=TIGHTEST)
+    _, none, _ = run(of, {3: 0.0}, FAULT, wrt=names, **given)
+    _, some, _ = run(of, {3: 1e-2}, FAULT, wrt=names, **given)
+    difference = (some.v - none.v) / 1e-2
+    middle = 0.5 * (none.tangents[:, 0] + some.tangents[:, 0])  # exact to the square of the step
+    assert np.abs(difference - middle).max() < 1e-5 * np.abs(middle).max()
 
 
 def test_derivatives_asked_for_do_not_change_the_run() -> None:

@@ -23,7 +23,7 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
             Period(),
             [BusFault(1180), LineTrip(23, 26), FaultSequence((BusFault(75), LineTrip(1, 2, 0.5)))],
             until=0.55,
-            wrt=("H", "H_22", "wind_690", "beta"),
+            wrt=("H", "H_22", "wind_690", "gamma"),
             facilities={22: object()},  # type: ignore[dict-item]
         )
     text = str(failure.value)
@@ -31,8 +31,8 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
     for line in (
         "wrt: 'H_22': bus 22 is not one of the sites 21, 75, 106, 108.",
         "wrt: 'wind_690': no bus 690.",
-        "wrt: 'beta' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every load) "
-        "and clear (s).",
+        "wrt: 'gamma' is not known. It takes H (all sites), H_<bus>, wind_<bus>, load (factor on every "
+        "load), clear (s) and beta (rating of the facilities).",
         "facilities: bus 22 is not a candidate site.",
         "facilities: object at bus 22 is no diagram. Way out: facility.gfl() and its like.",
         "hosting at bus 75 = -1.0 MW must be a number of at least 0.",
@@ -41,6 +41,20 @@ def test_bad_request_names_everything_at_once(grid: Grid) -> None:
         "fault at bus 75: it is a candidate site",
     ):
         assert f"\n  {line}" in text
+
+
+def test_a_rating_and_values_need_facilities_that_have_them(grid: Grid) -> None:
+    with pytest.raises(InputError) as failure:
+        grid.waveforms({75: 10.0}, BusFault(77), wrt=("beta",), values={"bess.tau": 0.01})
+    assert str(failure.value) == (
+        "ieee118: 2 problems\n  values: 'bess.tau': there are no facilities.\n"
+        "  wrt: 'beta': there are no facilities that it could rate."
+    )
+    with pytest.raises(InputError) as failure:
+        grid.waveforms({75: 10.0}, BusFault(77), facilities={75: facility.gfl()}, values={"bess.tauu": 0.01})
+    assert str(failure.value).startswith(
+        "ieee118: facility gfl at bus 75 has no parameter 'bess.tauu'. Did you mean 'bess."
+    )
 
 
 def test_more_derivatives_than_a_run_carries() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +16,7 @@ from dcvrt.grid.native.run import Simulated
 from dcvrt.models.machines import GenRou, Sexs, Tgov1
 from tests.grid.native.cases import NO_VRT, TIGHTEST, WINDY, away, case, engine, network, run, unit
 
-STEP = {"H": 0.5, "wind": 0.5, "load": 1e-4, "clear": 2e-5}
+STEP = {"H": 0.5, "wind": 0.5, "load": 1e-4, "clear": 2e-5, "beta": 1e-3}
 
 
 def shifted(fault: BusFault | LineTrip | FaultSequence, by: float):
@@ -38,14 +38,16 @@ def differences(
     name: str,
     times: list[np.ndarray],
     scale: float = 1.0,
+    values: Mapping[str, float] | None = None,
     **more: object,
 ) -> tuple[np.ndarray, list[Simulated]]:
     """Derivative of the voltages by four runs, fourth order in the step."""
     kind, _, bus = name.partition("_")
-    h = STEP[kind] * scale
+    h, values = STEP[kind] * scale, dict(values or {})
 
     def at(s: float) -> Simulated:
         own_hosting, own_period, own_fault, own_times = dict(hosting), period, fault, times
+        own_values = dict(values)
         if kind == "H":
             own_hosting[int(bus)] = hosting.get(int(bus), 0.0) + s * h
         elif kind == "wind":
@@ -54,13 +56,16 @@ def differences(
             )
         elif kind == "load":
             own_period = replace(period, load_scale=period.load_scale + s * h)
+        elif kind == "beta":
+            own_values["beta"] = values["beta"] + s * h
         else:
             own_fault = shifted(fault, s * h)
             own_times = [t.copy() for t in times]
             own_times[-2][-1] = own_times[-1][0] = own_fault.cleared_at
         _, found, _ = run(
-            of, own_hosting, own_fault, period=own_period, times=own_times, options=TIGHTEST, **more
-        )  # type: ignore[arg-type]
+            of, own_hosting, own_fault, period=own_period, times=own_times, options=TIGHTEST,
+            values=own_values, **more,
+        )  # type: ignore[arg-type]  # fmt: skip
         assert not found.status
         return found
 

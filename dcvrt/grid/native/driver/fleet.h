@@ -60,6 +60,7 @@ struct group {
     long first_port, first_state;
     long reads_v;    /* whether the source depends on the unit's own voltage */
     long angle;      /* state that is a rotor angle, or -1 */
+    double tolerance;          /* of its states, over that of the options */
     const double *p;           /* [pack][np][lane] */
     const double *moving_seed; /* [pack][direction][moving][lane]: dp/dtheta of the parameters that move */
     const double *held;        /* [pack][row][lane] */

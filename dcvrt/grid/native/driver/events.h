@@ -1,0 +1,291 @@
+/* Rows that fire, timers, bounds, loss of synchronism; derivatives cross an event with the jump term. */
+#ifndef DCVRT_EVENTS_H
+#define DCVRT_EVENTS_H
+
+#include "steps.h"
+
+static double *guards_of(struct run *r, const struct group *g, long pack, double t, const struct state *x,
+                         const struct moment *m)
+{
+    g->call->guards(g, pack, 0, t, x->x, x->xs, m->v, m->vs, r->guard, r->guards);
+    return r->guard;
+}
+
+/* Largest value of guards that can fire or start a timer; which of them is positive first is what is sought. */
+static double alarm(struct run *r, double t, const struct state *x, const struct moment *m)
+{
+    const struct fleet *f = r->fleet;
+    double most = -INFINITY;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        if (!(group->rows + group->bounds)) continue;
+        for (long pack = 0; pack < group->packs; pack++) {
+            const double *value = guards_of(r, group, pack, t, x, m);
+            for (long row = 0; row < group->rows + group->bounds; row++)
+                for (long lane = 0; lane < f->lanes; lane++) {
+                    double guard = value[row * f->lanes + lane];
+                    if (row < group->rows) {
+                        long a = group->row_automaton[row];
+                        if (group->mode[(pack * group->na + a) * f->lanes + lane] != group->row_source[row])
+                            continue;
+                        if (isfinite(group->since[(pack * group->rows + row) * f->lanes + lane])) continue;
+                    }
+                    if (guard > most) most = guard;
+                }
+        }
+    }
+    return most;
+}
+
+/* First time in the last step at which an alarm is positive; r->inside and r->here are left there. */
+static int locate(struct run *r, double *at)
+{
+    double low = 0.0, high = 1.0, g_low, g_high;
+    if (r->coupled) memcpy(r->here.v, r->k[0].v, r->size_v * sizeof(double));
+    inside_at(r, low);
+    if (voltages(r, r->t, &r->inside, &r->here, 0, r->ports)) return 1;
+    g_low = fmin(alarm(r, r->t, &r->inside, &r->here), 0.0);
+    inside_at(r, high);
+    if (voltages(r, r->t + r->h, &r->inside, &r->here, 0, r->ports)) return 1;
+    g_high = alarm(r, r->t + r->h, &r->inside, &r->here);
+    int side = 0;
+    for (int i = 0; i < 100 && (high - low) * r->h > LOCATED; i++) {
+        double middle = i % 4 == 3 || !isfinite(g_low) || g_high <= g_low
+                            ? 0.5 * (low + high)
+                            : (low * g_high - high * g_low) / (g_high - g_low);
+        double least = 0.01 * (high - low);
+        middle = fmin(fmax(middle, low + fmin(least, 0.5 * LOCATED / r->h)), high - fmin(least, 0.5 * LOCATED / r->h));
+        inside_at(r, middle);
+        if (voltages(r, r->t + middle * r->h, &r->inside, &r->here, 0, r->ports)) return 1;
+        double g = alarm(r, r->t + middle * r->h, &r->inside, &r->here);
+        if (g > 0.0) {
+            high = middle, g_high = g;
+            if (side == 1) g_low *= 0.5;
+            side = 1;
+        } else {
+            low = middle, g_low = g;
+            if (side == -1) g_high *= 0.5;
+            side = -1;
+        }
+    }
+    inside_at(r, high);
+    if (voltages(r, r->t + high * r->h, &r->inside, &r->here, 0, r->ports)) return 1;
+    *at = high;
+    return 0;
+}
+
+static void note(struct run *r, double t, long g, long row, long unit)
+{
+    struct record *record = r->record;
+    if (record->n_events < record->event_room) {
+        double *event = record->events + 4 * record->n_events;
+        event[0] = t, event[1] = g, event[2] = row, event[3] = unit;
+    }
+    record->n_events++;
+}
+
+static void set_mode(struct run *r, const struct group *g, long pack, long lane, long a, long mode, double t)
+{
+    long lanes = r->fleet->lanes;
+    g->mode[(pack * g->na + a) * lanes + lane] = mode;
+    g->entry[(pack * g->na + a) * lanes + lane] = t;
+    for (long k = 0, at = g->flag_begin[a]; k < g->flag_width[a]; k++) {
+        long before = 0;
+        for (long b = 0; b < a; b++) before += g->flag_width[b];
+        g->q[(pack * g->nq + before + k) * lanes + lane] = g->flag_values[at + mode * g->flag_width[a] + k];
+    }
+    for (long row = 0; row < g->rows; row++)
+        if (g->row_automaton[row] == a) g->since[(pack * g->rows + row) * lanes + lane] = INFINITY;
+    g->call->hoist(g, pack, r->d);
+}
+
+/* Derivatives of states along time, in the layout of derivatives by one direction, belong to no parameter. */
+static void along_time(const struct run *r, int on)
+{
+    for (long g = 0; g < r->fleet->groups; g++) r->fleet->group[g]->along = on;
+}
+
+/* Derivative of the time at which a guard crosses zero: -(dg/dtheta) / (dg/dt); r->here holds the moment. */
+static int crossing(struct run *r, const struct group *g, long row, long pack, long lane)
+{
+    long d = r->d, lanes = r->fleet->lanes, all = g->rows + g->bounds;
+    struct state moving = {r->now.x, r->stage.xs};
+    struct network still = {r->network->z, 0};
+    const struct network *network = r->network;
+    memcpy(moving.xs, r->here.f, r->n * sizeof(double));
+    memcpy(r->there.v, r->here.v, r->size_v * sizeof(double));
+    along_time(r, 1);
+    r->d = 1, r->network = &still;
+    int bad = voltages(r, r->t, &moving, &r->there, 0, r->ports);
+    g->call->guards(g, pack, 1, r->t, moving.x, moving.xs, r->there.v, r->there.vs, r->guard, r->guards);
+    double rate = r->guards[row * lanes + lane];
+    r->d = d, r->network = network;
+    along_time(r, 0);
+    if (bad) return 1;
+    g->call->guards(g, pack, d, r->t, r->now.x, r->now.xs, r->here.v, r->here.vs, r->guard, r->guards);
+    for (long k = 0; k < d; k++)
+        r->dt[k] = rate != 0.0 ? -r->guards[(k * all + row) * lanes + lane] / rate : 0.0;
+    r->dt_known = 1;
+    return 0;
+}
+
+/* S += sign f dt over the whole fleet. */
+static void shift_by(struct run *r, const double *f, double sign, const double *dt)
+{
+    const struct fleet *fleet = r->fleet;
+    for (long g = 0; g < fleet->groups; g++) {
+        const struct group *group = fleet->group[g];
+        long each = group->nx * fleet->lanes;
+        for (long pack = 0; pack < group->packs; pack++)
+            for (long k = 0; k < r->d; k++) {
+                double *s = r->now.xs + group->first_state * r->d + (pack * r->d + k) * each;
+                const double *rate = f + group->first_state + pack * each;
+                for (long e = 0; e < each; e++) s[e] += sign * rate[e] * dt[k];
+            }
+    }
+}
+
+/* One unit changes its mode at an instant that moves by r->dt. Derivatives cross it with the jump term: those of
+ * x- at the instant itself are S- + f- dt; the reset maps them; behind it f+ dt is taken off again. */
+static int jump(struct run *r, long g, long row, long pack, long lane)
+{
+    const struct group *group = r->fleet->group[g];
+    long lanes = r->fleet->lanes, a = group->row_automaton[row], d = r->d;
+    if (d) {
+        if (rates(r, r->t, &r->now, &r->here)) return NO_VOLTAGE;
+        if (!r->dt_known && crossing(r, group, row, pack, lane)) return NO_VOLTAGE;
+        shift_by(r, r->here.f, 1.0, r->dt);
+    }
+    if (group->row_resets[row]) {
+        if (voltages(r, r->t, &r->now, &r->here, 0, r->ports)) return NO_VOLTAGE;
+        group->call->reset(group, row, pack, (int)lane, d, r->t, r->now.x, r->now.xs, r->here.v, r->here.vs);
+    }
+    set_mode(r, group, pack, lane, a, group->row_target[row], r->t);
+    for (long k = 0; k < d; k++) group->entries[((pack * d + k) * group->na + a) * lanes + lane] = r->dt[k];
+    if (d) {
+        if (rates(r, r->t, &r->now, &r->here)) return NO_VOLTAGE;
+        shift_by(r, r->here.f, -1.0, r->dt);
+    }
+    return COMPLETED;
+}
+
+/* Everything that is due at r->t: rows that fire, timers that start or lapse. Where r->dt is not known, the instant
+ * is that of a located crossing. */
+static int settle(struct run *r)
+{
+    const struct fleet *f = r->fleet;
+    for (int jumps = 0;; jumps++) {
+        int fired = 0;
+        if (voltages(r, r->t, &r->now, &r->here, 0, r->ports)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
+        for (long g = 0; g < f->groups && !fired; g++) {
+            const struct group *group = f->group[g];
+            if (!(group->rows + group->bounds)) continue;
+            for (long pack = 0; pack < group->packs && !fired; pack++) {
+                const double *value = guards_of(r, group, pack, r->t, &r->now, &r->here);
+                for (long row = group->rows; row < group->rows + group->bounds; row++)
+                    for (long lane = 0; lane < f->lanes; lane++)
+                        if (value[row * f->lanes + lane] > 0.0)
+                            return failed(r, LEFT_BOUNDS, r->t, g, pack * f->lanes + lane, row - group->rows, 0);
+                for (long row = 0; row < group->rows && !fired; row++)
+                    for (long lane = 0; lane < f->lanes && !fired; lane++) {
+                        long a = group->row_automaton[row];
+                        if (group->mode[(pack * group->na + a) * f->lanes + lane] != group->row_source[row])
+                            continue;
+                        double *since = &group->since[(pack * group->rows + row) * f->lanes + lane];
+                        double held = group->held[(pack * group->rows + row) * f->lanes + lane];
+                        int was = isfinite(*since);
+                        if (value[row * f->lanes + lane] <= 0.0 && !(was && r->t >= *since + held - SAME_INSTANT)) {
+                            *since = INFINITY;
+                            continue;
+                        }
+                        long at = (pack * r->d * group->rows + row) * f->lanes + lane, step = group->rows * f->lanes;
+                        if (!was && held > 0.0) {
+                            *since = r->t;
+                            if (r->d) {
+                                if (!r->dt_known && (rates(r, r->t, &r->now, &r->here) ||
+                                                     crossing(r, group, row, pack, lane)))
+                                    return failed(r, NO_VOLTAGE, r->t, g, pack * f->lanes + lane, row, 0);
+                                for (long k = 0; k < r->d; k++) group->sinces[at + k * step] = r->dt[k];
+                                value = guards_of(r, group, pack, r->t, &r->now, &r->here);
+                            }
+                        }
+                        if (held > 0.0 && r->t < *since + held - SAME_INSTANT) continue;
+                        if (held > 0.0) {
+                            for (long k = 0; k < r->d; k++) r->dt[k] = group->sinces[at + k * step];
+                            r->dt_known = 1;
+                        }
+                        if (jumps >= MAX_JUMPS_AT_ONCE)
+                            return failed(r, CHATTER, r->t, g, pack * f->lanes + lane, row, 0);
+                        int status = jump(r, g, row, pack, lane);
+                        if (status) return failed(r, status, r->t, g, pack * f->lanes + lane, row, 0);
+                        note(r, r->t, g, row, pack * f->lanes + lane);
+                        fired = 1;
+                    }
+            }
+        }
+        if (!fired) return COMPLETED;
+    }
+}
+
+/* Time of the next timer that runs out. */
+static double next_timer(const struct run *r)
+{
+    const struct fleet *f = r->fleet;
+    double next = INFINITY;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        long count = group->packs * group->rows * f->lanes;
+        for (long k = 0; k < count; k++) {
+            double due = group->since[k] + group->held[k];
+            if (due < next) next = due;
+        }
+    }
+    return next;
+}
+
+/* Whether a timer that runs has lost its guard at the end of the step. */
+static int lapses(struct run *r, double t, const struct state *x, const struct moment *m)
+{
+    const struct fleet *f = r->fleet;
+    int any = 0;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        long count = group->packs * group->rows * f->lanes;
+        int running = 0;
+        for (long k = 0; k < count; k++) running |= isfinite(group->since[k]);
+        if (!running) continue;
+        for (long pack = 0; pack < group->packs; pack++) {
+            const double *value = guards_of(r, group, pack, t, x, m);
+            for (long k = 0; k < group->rows * f->lanes; k++) {
+                double *since = &group->since[pack * group->rows * f->lanes + k];
+                if (isfinite(*since) && value[k] <= 0.0) *since = INFINITY, any = 1;
+            }
+        }
+    }
+    return any;
+}
+
+/* Which rotor is further from the centre of inertia than allowed; -1 where none is. */
+static long out_of_step(const struct run *r, long *in_group, double *away)
+{
+    const struct fleet *f = r->fleet;
+    double sum = 0.0, weight = 0.0;
+    for (int pass = 0; pass < 2; pass++)
+        for (long g = 0; g < f->groups; g++) {
+            const struct group *group = f->group[g];
+            if (group->angle < 0) continue;
+            for (long pack = 0; pack < group->packs; pack++)
+                for (long lane = 0; lane < f->lanes; lane++) {
+                    double m = group->inertia[pack * f->lanes + lane];
+                    double angle = r->now.x[group->first_state + (pack * group->nx + group->angle) * f->lanes + lane];
+                    if (!pass) sum += m * angle, weight += m;
+                    else if (m > 0 && fabs(angle - sum / weight) > r->options->out_of_step) {
+                        *in_group = g, *away = angle - sum / weight;
+                        return pack * f->lanes + lane;
+                    }
+                }
+        }
+    return -1;
+}
+
+#endif

@@ -1,0 +1,163 @@
+/* One step of the pair: stages, error over tolerance, fastest rate, dense output. */
+#ifndef DCVRT_STEPS_H
+#define DCVRT_STEPS_H
+
+#include "voltages.h"
+
+static inline __attribute__((always_inline)) void combine(long n, const double *restrict x, double h, int s,
+                                                          double *const *k, double *restrict into)
+{
+    for (long i = 0; i < n; i++) {
+        double sum = A[s][0] * k[0][i];
+        for (int j = 1; j < s; j++)
+            if (A[s][j] != 0.0) sum += A[s][j] * k[j][i];
+        into[i] = x[i] + h * sum;
+    }
+}
+
+static int stage(struct run *r, int s)
+{
+    double *k[STAGES], *ks[STAGES];
+    for (int j = 0; j < s; j++) k[j] = r->k[j].f, ks[j] = r->k[j].fs;
+    struct state *into = s == STAGES - 1 ? &r->next : &r->stage;
+    switch (s) {
+    case 1: combine(r->n, r->now.x, r->h, 1, k, into->x); combine(r->ns, r->now.xs, r->h, 1, ks, into->xs); break;
+    case 2: combine(r->n, r->now.x, r->h, 2, k, into->x); combine(r->ns, r->now.xs, r->h, 2, ks, into->xs); break;
+    case 3: combine(r->n, r->now.x, r->h, 3, k, into->x); combine(r->ns, r->now.xs, r->h, 3, ks, into->xs); break;
+    case 4: combine(r->n, r->now.x, r->h, 4, k, into->x); combine(r->ns, r->now.xs, r->h, 4, ks, into->xs); break;
+    case 5: combine(r->n, r->now.x, r->h, 5, k, into->x); combine(r->ns, r->now.xs, r->h, 5, ks, into->xs); break;
+    default: combine(r->n, r->now.x, r->h, 6, k, into->x); combine(r->ns, r->now.xs, r->h, 6, ks, into->xs);
+    }
+    if (r->coupled) memcpy(r->k[s].v, r->k[s - 1].v, r->size_v * sizeof(double));
+    return rates(r, r->t + NODE[s] * r->h, into, &r->k[s]);
+}
+
+static inline double larger(double a, double b)
+{
+    a = fabs(a), b = fabs(b);
+    return a > b ? a : b;
+}
+
+static inline double over_of(const struct run *r, long i)
+{
+    const struct options *o = r->options;
+    double e = ERROR[0] * r->k[0].f[i];
+    for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].f[i];
+    return fabs(r->h * e) / (o->atol + o->rtol * larger(r->now.x[i], r->next.x[i]));
+}
+
+/* Largest error of a step, in states [from, to), over its tolerance; no number where one is none. */
+static double error_in(const struct run *r, long from, long to)
+{
+    double most[BLOCK] = {0}, sum[BLOCK] = {0}, worst = 0.0, all = 0.0;
+    long i = from;
+    for (; i + BLOCK <= to; i += BLOCK)
+        for (int l = 0; l < BLOCK; l++) {
+            double over = over_of(r, i + l);
+            most[l] = over > most[l] ? over : most[l];
+            sum[l] += over;
+        }
+    for (; i < to; i++) sum[i % BLOCK] += over_of(r, i), most[i % BLOCK] = larger(most[i % BLOCK], over_of(r, i));
+    for (int l = 0; l < BLOCK; l++) worst = larger(worst, most[l]), all += sum[l];
+    return isfinite(all) ? worst : NAN;
+}
+
+/* Largest error of a step over its tolerance. */
+static double error_of(struct run *r)
+{
+    const struct options *o = r->options;
+    const struct fleet *f = r->fleet;
+    double worst = 0.0;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        long from = group->first_state, to = from + group->packs * group->nx * f->lanes;
+        double over = error_in(r, from, to) / group->tolerance;
+        if (!(over <= worst)) worst = over;
+        if (isnan(worst)) return INFINITY;
+    }
+    if (!r->d || !isfinite(worst)) return worst;
+    for (int pass = 0; pass < 2; pass++) {
+        if (!pass)
+            for (long k = 0; k < r->d; k++) r->scale[k] = 0.0;
+        for (long g = 0; g < f->groups; g++) {
+            const struct group *group = f->group[g];
+            long each = group->nx * f->lanes, at = group->first_state * r->d;
+            for (long pack = 0; pack < group->packs; pack++)
+                for (long k = 0; k < r->d; k++, at += each)
+                    for (long i = at; i < at + each; i++) {
+                        double size = fmax(fabs(r->now.xs[i]), fabs(r->next.xs[i]));
+                        if (!pass) {
+                            r->scale[k] = fmax(r->scale[k], size);
+                            continue;
+                        }
+                        double e = ERROR[0] * r->k[0].fs[i];
+                        for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].fs[i];
+                        double weight = o->theta_rtol * (size + o->theta_share * r->scale[k]);
+                        double over = weight > 0.0 ? fabs(r->h * e) / weight : 0.0;
+                        if (!(over <= worst)) worst = over;
+                    }
+        }
+    }
+    return worst;
+}
+
+/* Largest rate at which a unit moves back to where it is drawn, from the last two stages of a step: both are at its
+ * end, so that their states differ by what the fastest motion makes of them. */
+static double fastest(const struct run *r)
+{
+    const struct fleet *f = r->fleet;
+    double most = 0.0;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        for (long pack = 0; pack < group->packs; pack++) {
+            double rate[BLOCK] = {0}, state[BLOCK] = {0};
+            long at = group->first_state + pack * group->nx * f->lanes;
+            for (long i = 0; i < group->nx; i++, at += f->lanes)
+                for (long l = 0; l < f->lanes; l++) {
+                    double df = r->k[STAGES - 1].f[at + l] - r->k[STAGES - 2].f[at + l];
+                    double dx = r->next.x[at + l] - r->stage.x[at + l];
+                    rate[l] += df * df, state[l] += dx * dx;
+                }
+            for (long l = 0; l < f->lanes; l++)
+                if (state[l] > 1e-24 && rate[l] > most * state[l]) most = rate[l] / state[l];
+        }
+    }
+    return sqrt(most);
+}
+
+static void dense_of(const struct run *r, long n, const double *x, const double *x1, double *const *k, double *c)
+{
+    for (long i = 0; i < n; i++) {
+        double sum = LAST_TERM[0] * k[0][i];
+        for (int j = 2; j < STAGES; j++) sum += LAST_TERM[j] * k[j][i];
+        double change = x1[i] - x[i], bend = r->h * k[0][i] - change;
+        c[i] = x[i];
+        c[n + i] = change;
+        c[2 * n + i] = bend;
+        c[3 * n + i] = change - r->h * k[STAGES - 1][i] - bend;
+        c[4 * n + i] = r->h * sum;
+    }
+}
+
+static void dense_step(struct run *r)
+{
+    double *k[STAGES], *ks[STAGES];
+    for (int j = 0; j < STAGES; j++) k[j] = r->k[j].f, ks[j] = r->k[j].fs;
+    dense_of(r, r->n, r->now.x, r->next.x, k, r->dense);
+    dense_of(r, r->ns, r->now.xs, r->next.xs, ks, r->denses);
+}
+
+static void dense_at(long n, const double *restrict c, double s, double *restrict x)
+{
+    double u = 1.0 - s;
+    for (long i = 0; i < n; i++)
+        x[i] = c[i] + s * (c[n + i] + u * (c[2 * n + i] + s * (c[3 * n + i] + u * c[4 * n + i])));
+}
+
+static void inside_at(struct run *r, double s)
+{
+    dense_at(r->n, r->dense, s, r->inside.x);
+    dense_at(r->ns, r->denses, s, r->inside.xs);
+}
+
+#endif

@@ -1,0 +1,223 @@
+/* Voltages from states: V = Z s, by Newton's method where a source depends on its own voltage; rates from both. */
+#ifndef DCVRT_VOLTAGES_H
+#define DCVRT_VOLTAGES_H
+
+#include "run.h"
+
+enum { NEWTON = 30 };
+#define NEWTON_TOLERANCE 1e-11
+#define SLOW 0.1
+
+/* -- linear algebra -------------------------------------------------------------------------------------- */
+
+/* Rows [from, to) of Z times several columns; from and to are multiples of BLOCK. */
+static inline __attribute__((always_inline)) void product(const struct run *r, const double *z, int count,
+                                                          const double *s, long stride_s, double *v,
+                                                          long stride_v, long from, long to, int add)
+{
+    long columns = r->ports;
+    for (long row = from; row < to; row += BLOCK) {
+        const double *at = z + (row / BLOCK) * columns * 2 * BLOCK;
+        block re[8], im[8];
+        for (int k = 0; k < count; k++) re[k] = im[k] = (block){0};
+        for (long j = 0; j < columns; j++, at += 2 * BLOCK) {
+            block zr = *(const block *)at, zi = *(const block *)(at + BLOCK);
+            for (int k = 0; k < count; k++) {
+                double a = s[k * stride_s + j], b = s[k * stride_s + columns + j];
+                re[k] += zr * a - zi * b;
+                im[k] += zr * b + zi * a;
+            }
+        }
+        for (int k = 0; k < count; k++) {
+            block *vr = (block *)(v + k * stride_v + row), *vi = (block *)(v + k * stride_v + r->rows + row);
+            if (add) *vr += re[k], *vi += im[k];
+            else *vr = re[k], *vi = im[k];
+        }
+    }
+}
+
+static void products(const struct run *r, const double *z, long count, const double *s, long stride_s, double *v,
+                     long stride_v, long from, long to, int add)
+{
+    for (; count > 0; count -= 4, s += 4 * stride_s, v += 4 * stride_v) switch (count) {
+        case 1: product(r, z, 1, s, stride_s, v, stride_v, from, to, add); break;
+        case 2: product(r, z, 2, s, stride_s, v, stride_v, from, to, add); break;
+        case 3: product(r, z, 3, s, stride_s, v, stride_v, from, to, add); break;
+        default: product(r, z, 4, s, stride_s, v, stride_v, from, to, add);
+        }
+}
+
+/* LU factors with row pivots, in place; 0 where the matrix is singular. */
+static int factorise(double *a, long n, long *pivot)
+{
+    for (long k = 0; k < n; k++) {
+        long best = k;
+        for (long i = k + 1; i < n; i++)
+            if (fabs(a[i * n + k]) > fabs(a[best * n + k])) best = i;
+        pivot[k] = best;
+        if (!(fabs(a[best * n + k]) > 1e-14)) return 0;
+        if (best != k)
+            for (long j = 0; j < n; j++) {
+                double swap = a[k * n + j];
+                a[k * n + j] = a[best * n + j];
+                a[best * n + j] = swap;
+            }
+        for (long i = k + 1; i < n; i++) {
+            double factor = a[i * n + k] /= a[k * n + k];
+            for (long j = k + 1; j < n; j++) a[i * n + j] -= factor * a[k * n + j];
+        }
+    }
+    return 1;
+}
+
+static void back(const double *a, long n, const long *pivot, double *b)
+{
+    for (long k = 0; k < n; k++)
+        if (pivot[k] != k) {
+            double swap = b[k];
+            b[k] = b[pivot[k]];
+            b[pivot[k]] = swap;
+        }
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j < i; j++) b[i] -= a[i * n + j] * b[j];
+    for (long i = n - 1; i >= 0; i--) {
+        for (long j = i + 1; j < n; j++) b[i] -= a[i * n + j] * b[j];
+        b[i] /= a[i * n + i];
+    }
+}
+
+/* -- the network ----------------------------------------------------------------------------------------- */
+
+static double z_entry(const struct run *r, long row, long column, int part)
+{
+    return r->network->z[((row / BLOCK) * r->ports + column) * 2 * BLOCK + part * BLOCK + row % BLOCK];
+}
+
+/* Slopes ds/dv of all coupled ports at these voltages: [port][2][2]. */
+static void slopes(struct run *r, double t, const double *x, const double *v)
+{
+    const struct fleet *f = r->fleet;
+    double *pack = r->pack;
+    for (long g = 0, k = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        if (!group->reads_v) continue;
+        group->call->source_by_v(group, t, x, v, pack);
+        for (long i = 0; i < group->packs; i++)
+            for (long lane = 0; lane < f->lanes; lane++, k++)
+                for (int e = 0; e < 4; e++) r->by_v[4 * k + e] = pack[(i * 4 + e) * f->lanes + lane];
+    }
+}
+
+/* Factors of 1 - Z ds/dv on the coupled ports. Entries of ds/dv stand column after column. */
+static int factorise_ports(struct run *r)
+{
+    long c = r->coupled, n = 2 * c;
+    for (long i = 0; i < c; i++)
+        for (long j = 0; j < c; j++) {
+            double zr = z_entry(r, r->coupled_port[i], r->coupled_port[j], 0);
+            double zi = z_entry(r, r->coupled_port[i], r->coupled_port[j], 1);
+            const double *by = r->by_v + 4 * j;
+            for (int q = 0; q < 2; q++) {
+                double a = by[2 * q], b = by[2 * q + 1];
+                r->matrix[i * n + j + q * c] = (i == j && q == 0) - (zr * a - zi * b);
+                r->matrix[(i + c) * n + j + q * c] = (i == j && q == 1) - (zr * b + zi * a);
+            }
+        }
+    r->factored = factorise(r->matrix, n, r->pivot);
+    return r->factored;
+}
+
+static void sources(struct run *r, long directions, double t, const struct state *x, struct moment *m, int coupled)
+{
+    const struct fleet *f = r->fleet;
+    for (long g = 0; g < f->groups; g++)
+        if (!coupled || f->group[g]->reads_v)
+            f->group[g]->call->source(f->group[g], directions, t, x->x, x->xs, m->v, m->vs, m->s, m->ss);
+}
+
+/* Voltages at rows [0, rows) of Z from the states, with their derivatives; m->v holds a guess of the voltages
+ * of coupled ports. Nonzero where there are none. */
+static int voltages(struct run *r, double t, const struct state *x, struct moment *m, long from, long rows)
+{
+    long n = r->coupled, stride = 2 * r->rows, ports = 2 * r->ports, d = r->d;
+    const double *z = r->network->z;
+    if (n) {
+        double last = INFINITY;
+        int iteration = 0;
+        sources(r, 0, t, x, m, 0);
+        for (;; iteration++) {
+            if (iteration == NEWTON) return 1;
+            double *new = r->trial, worst = 0.0;
+            products(r, z, 1, m->s, ports, new, stride, 0, r->ports, 0);
+            for (long k = 0; k < n; k++) {
+                long p = r->coupled_port[k];
+                r->right[k] = new[p] - m->v[p];
+                r->right[n + k] = new[r->rows + p] - m->v[r->rows + p];
+                worst = fmax(worst, fmax(fabs(r->right[k]), fabs(r->right[n + k])));
+            }
+            if (!isfinite(worst)) return 1;
+            if (worst < NEWTON_TOLERANCE) break;
+            if (!r->factored || worst > SLOW * last) {
+                slopes(r, t, x->x, m->v);
+                if (!factorise_ports(r)) return 1;
+            }
+            last = worst;
+            back(r->matrix, 2 * n, r->pivot, r->right);
+            for (long k = 0; k < n; k++) {
+                long p = r->coupled_port[k];
+                m->v[p] += r->right[k];
+                m->v[r->rows + p] += r->right[n + k];
+            }
+            sources(r, 0, t, x, m, 1);
+        }
+        if (d) { /* derivatives of the voltages of coupled ports, by the exact slopes */
+            slopes(r, t, x->x, m->v);
+            if (!factorise_ports(r)) return 1;
+        }
+    }
+    if (!d) {
+        if (!n) sources(r, 0, t, x, m, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, from, rows, 0);
+        return 0;
+    }
+    if (n) {
+        memset(m->vs, 0, d * stride * sizeof(double));
+        sources(r, d, t, x, m, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, 0, rows, 0);
+        products(r, z, d, m->ss, ports, m->vs, stride, 0, r->ports, 0);
+        for (long k = 0; k < d; k++) {
+            if (r->network->dz && r->network->dz[k])
+                products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, 0, r->ports, 1);
+            for (long c = 0; c < n; c++) {
+                r->right[c] = m->vs[k * stride + r->coupled_port[c]];
+                r->right[n + c] = m->vs[k * stride + r->rows + r->coupled_port[c]];
+            }
+            back(r->matrix, 2 * n, r->pivot, r->right);
+            for (long c = 0; c < n; c++) {
+                m->vs[k * stride + r->coupled_port[c]] = r->right[c];
+                m->vs[k * stride + r->rows + r->coupled_port[c]] = r->right[n + c];
+            }
+        }
+        sources(r, d, t, x, m, 1);
+        from = 0;
+    } else {
+        sources(r, d, t, x, m, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, from, rows, 0);
+    }
+    products(r, z, d, m->ss, ports, m->vs, stride, from, rows, 0);
+    for (long k = 0; k < d; k++)
+        if (r->network->dz && r->network->dz[k])
+            products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, from, rows, 1);
+    return 0;
+}
+
+static int rates(struct run *r, double t, const struct state *x, struct moment *m)
+{
+    if (voltages(r, t, x, m, 0, r->ports)) return 1;
+    const struct fleet *f = r->fleet;
+    for (long g = 0; g < f->groups; g++)
+        f->group[g]->call->flow(f->group[g], r->d, t, x->x, x->xs, m->v, m->vs, m->f, m->fs);
+    return 0;
+}
+
+#endif
