@@ -115,14 +115,14 @@ class PowerFlow:
     .. math:: S_k = V_k \Big(\sum_m Y_{km} V_m\Big)^*
 
     with P given at all buses but the slack and Q at `pq` buses. `pv` and `slack` buses hold `v_set`. With
-    `reactive_limits` a `pv` bus does so only as far as its units can:
+    `reactive_limits` they do so only as far as their units can:
 
     .. math::
         \underline Q \le Q \le \overline Q, \qquad
         V = V^{set} \;\text{or}\; (Q = \overline Q,\, V \le V^{set}) \;\text{or}\;
         (Q = \underline Q,\, V \ge V^{set})
 
-    and the bus is `pq` where it cannot (PV-PQ switching, both ways). The slack bus has no limits.
+    and Q is given where they cannot (PV-PQ switching, both ways); the slack bus keeps its angle.
 
     Many hours are solved together by chord Newton: hours of similar load share one Jacobian, kept for the
     next call; residuals are exact, so only the number of steps suffers.
@@ -138,8 +138,9 @@ class PowerFlow:
         self.network, self.reactive_limits = network, reactive_limits
         kind = np.array(network.kind)
         self.pq = np.flatnonzero(kind == "pq")
-        self.pv = np.flatnonzero(kind == "pv") if reactive_limits else np.zeros(0, dtype=np.int64)
-        """Buses that may switch; none without `reactive_limits`."""
+        self.pv = np.flatnonzero(kind != "pq") if reactive_limits else np.zeros(0, dtype=np.int64)
+        """Buses whose units hold the voltage and may let it go, the slack bus among them; none without
+        `reactive_limits`."""
         self.free = np.r_[np.flatnonzero(kind == "pv"), self.pq]
         """Buses whose angle is unknown: `pv`, then `pq`."""
         self.moving = np.r_[self.pq, self.pv]

@@ -240,9 +240,8 @@ class AcVerdict:
     status : str
         What came out of the voltages, then how far units are beyond their reactive limits.
     reactive, reactive_unhosted : ReactiveExcess or None
-        Units beyond their reactive limits at the plan, and the same with nothing hosted: with
-        `reactive_limits` only those at the slack bus can be. `passed` says nothing about them. None when no
-        hour has a solution.
+        Units beyond their reactive limits at the plan, and the same with nothing hosted: none with
+        `reactive_limits`. `passed` says nothing about them. None when no hour has a solution.
     """
 
     passed: bool

@@ -247,9 +247,8 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         )
     reactive, unhosted = problem.ac.reactive_excess(H, solved.v[:, good], good), problem.ac.reactive_unhosted
     if reactive or unhosted:
-        free = "that of the slack bus is" if problem.reactive_limits else "the limits are"
         status += (
-            f" Units beyond their reactive limits in the worst hours ({free} not enforced): "
+            " Units beyond their reactive limits in the worst hours (the limits are not enforced): "
             f"{reactive}. With nothing hosted: {unhosted}."
         )
     return AcVerdict(

@@ -83,12 +83,30 @@ def test_bus_switches_to_the_voltage_of_its_closed_form(
     case = condenser(0.2, q_max, q_min, load, v_set)
     injection = schedule.injections(case, np.ones(1), {})[:, 0]
     found = PowerFlow(case, reactive_limits=True).solve(injection)
-    assert found.limited.tolist() == [at]
+    assert found.limited.tolist() == [0, at]
     limit = {1: q_max, -1: q_min, 0: np.nan}[at]
     expected = v_set if at == 0 else lossless(0.2, load.real / 100, (load.imag - limit) / 100)
     assert abs(found.v[1]) == pytest.approx(expected, abs=1e-8)
     batch = PowerFlow(case, reactive_limits=True).solve_hours(np.repeat(injection[:, None], 3, axis=1))
     assert abs(batch.require().v[1]) == pytest.approx(np.full(3, expected), abs=1e-8)
+
+
+@pytest.mark.parametrize("q_max", [-5.0, 3.0, 7.0])
+def test_the_slack_bus_lets_its_voltage_go_too(q_max: float) -> None:
+    """Bus 2 holds 1 pu and takes P over x; with Q_1 given, u = V_1^2 solves
+    u^2 - (1 + 2 x Q_1) u + x^2 (P^2 + Q_1^2) = 0."""
+    x, p, q = 0.2, 1.2, q_max / 100
+    wide = condenser(x, 999.0, -999.0, 100 * p + 20j)
+    units = wide.generators
+    case = replace(wide, generators=replace(units, q_max=np.array([q_max, 999.0])))
+    found = PowerFlow(case, reactive_limits=True).solve(schedule.injections(case, np.ones(1), {})[:, 0])
+    b = 1 + 2 * x * q
+    assert found.limited.tolist() == [1, 0]
+    assert abs(found.v[1]) == pytest.approx(1.0, abs=1e-12)
+    assert abs(found.v[0]) ** 2 == pytest.approx(
+        (b + np.sqrt(b * b - 4 * x * x * (p * p + q * q))) / 2, abs=1e-9
+    )
+    assert np.angle(found.v[0]) == 0.0
 
 
 def test_without_limits_the_set_point_is_held_whatever_it_takes() -> None:

@@ -55,9 +55,9 @@ def reactive_limits(findings: Findings) -> list[str]:
     return [
         f"Units beyond their limits at {name}, in the worst hours: {hosted}.",
         f"The same with nothing hosted: {unhosted}. The difference is due to the hosted load.",
-        "A passed AC power flow is a verdict on voltages that rest on this reactive power; with "
-        + ("that of the slack bus" if findings.study.hosting.reactive_limits else "the limits")
-        + " enforced, buses would leave their set points and the capacities would change.",
+        "A passed AC power flow is a verdict on voltages that rest on this reactive power; with the limits "
+        "enforced (hosting.reactive_limits), buses would leave their set points and the capacities would "
+        "change.",
     ]
 
 

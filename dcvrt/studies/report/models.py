@@ -64,7 +64,7 @@ def assumptions(findings: Findings) -> Safe:
             (
                 "Reactive power",
                 "Generators hold their voltages as far as their reactive limits let them, in the power flow "
-                "of the plans and before every fault; at the slack bus only before a fault."
+                "of the plans and before every fault."
                 if h.reactive_limits
                 else "Generators hold their voltages; their reactive limits are not enforced, neither in the "
                 "power flow of the plans nor before the faults.",

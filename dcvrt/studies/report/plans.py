@@ -143,7 +143,7 @@ def plans(findings: Findings) -> Safe:
             "fault. The AC power flow covers every hour; the error is that of the linear voltage screen "
             "near a limit. The last columns say how far units are beyond their reactive limits: "
             + (
-                "only those at the slack bus can be."
+                "none is, as these are enforced."
                 if findings.study.hosting.reactive_limits
                 else "these are not enforced, the voltages of the units are held whatever that takes."
             )
