@@ -84,7 +84,7 @@ def _setting(smoke: bool) -> Setting:
             "hosting": file.hosting.model_copy(update={"hours": [8400, 8568]}),
         }
         file = file.model_copy(update=change)
-    return study._setting(file)
+    return study.setting(file)
 
 
 def _request(

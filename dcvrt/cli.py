@@ -6,6 +6,7 @@ or a facility fails its envelope; 4 incomplete: something was set aside or did n
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dcvrt import __version__, envelopes, scenarios
-from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationError
+from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationError, raise_all
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -188,6 +189,75 @@ def _console(width: int = 140) -> Console:
 
 def _number(value: object, form: str) -> str:
     return "" if value is None or value != value else format(value, form)
+
+
+# -- design --------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def design(
+    file: Annotated[Path | None, typer.Argument(help="Study file; without one, the IEEE-118 study.")] = None,
+    hosting: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SITE=MW,...", help="Hosted capacities, as 21=30,75=150; others host nothing."),
+    ] = None,
+    mode: Annotated[
+        list[str] | None, typer.Option(help="Facility variant; repeatable. Default: those of the study.")
+    ] = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATH",
+            help="What is sought; repeatable. Default: beta, and with the rating found, rounded up to a step "
+            "of 0.05, battery power bess.P_dis and DC hold-up dc.T_hold.",
+        ),
+    ] = None,
+    beta: Annotated[
+        float | None, typer.Option(help="Rating with which other parameters than beta are sought.")
+    ] = None,
+    low: Annotated[float | None, typer.Option(help="Low end of the range; default: the bound.")] = None,
+    high: Annotated[float | None, typer.Option(help="High end of the range; default: the bound.")] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="Simulator of the faults: native, andes. Default: the study's replay.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Plain data instead of a table.")] = False,
+) -> None:
+    """The least rating, battery and DC hold-up with which given capacities ride through all faults.
+
+    Each answer is replayed: it passes, and the value just below it fails. The network's own limits are not
+    looked at; a study does that.
+
+    Exit codes: 0 every answer found; 2 bad input; 3 some value does not exist in its range;
+
+    4 a fault has no simulation.
+    """
+    from dcvrt.studies import design as designing
+    from dcvrt.studies.study import Study
+
+    capacities, problems = designing.hosting_of(hosting or [])
+    if not hosting:
+        problems.append("--hosting is needed, for example --hosting 21=30,75=150.")
+    loaded = Study.load(file)
+    setting = loaded.setting()
+    ask = designing.Ask(
+        capacities,
+        tuple(mode or loaded.file.facility.modes),
+        tuple(parameter or ()),
+        beta,
+        low,
+        high,
+        engine or loaded.file.replay.engine,
+    )
+    raise_all(problems + designing.problems_of(ask, setting), "design")
+    answers = designing.design(setting, ask)
+    if as_json:
+        print(json.dumps([answer.as_data() for answer in answers], indent=2))
+    else:
+        print(designing.header(setting, ask))
+        _console(80).print(designing.table_of(answers))
+        print(designing.FOOTER)
+    if any(answer.value is None for answer in answers):
+        raise typer.Exit(INFEASIBLE)
 
 
 # -- one facility --------------------------------------------------------------------------------------------

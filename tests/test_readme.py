@@ -18,8 +18,8 @@ def test_script_runs_as_written(script: str, tmp_path: Path, monkeypatch: pytest
     exec(compile(script, "README.md", "exec"), {"__name__": "__main__"})
 
 
-def test_there_are_four_scripts() -> None:
-    assert len(SCRIPTS) == 4
+def test_there_are_five_scripts() -> None:
+    assert len(SCRIPTS) == 5
 
 
 def test_files_that_it_points_to_exist() -> None:

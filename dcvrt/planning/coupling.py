@@ -111,9 +111,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
             else:
                 found[label] = runs[fault].waveforms
         if found:
-            rows = replay._facility_rows(
-                one, period.name, mode, [float(beta)], found, all_sites, period.dc_factor
-            )
+            rows = replay.facility_rows(one, mode, [float(beta)], found)
             answer["rows"] += rows
             answer["facility"] += len(rows)
     return answer

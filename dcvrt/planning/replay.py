@@ -72,17 +72,11 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
     the voltage, and through the facility into the margin. On its own base the facility does not change with
     its size, so there is no further term by the site's own H.
     """
-    from dcvrt.grid import Period
-
-    given = dict(request["period"])
-    wind = {int(bus): mw for bus, mw in given.pop("wind").items()}
-    period = Period(wind=wind, **given)
-    sites = [int(bus) for bus in request["sites"]]
-    hosting = dict(zip(sites, map(float, request["hosting"]), strict=True))
+    hosting, period = hosting_of(request), period_of(request)
     runs = [(mode, float(beta)) for mode, beta in request["runs"]]
     answer: dict[str, Any] = {"rows": [], "waveforms": [], "grid": 0, "facility": 0}
     found: dict[str, Mapping[int, Waveform]] = {}
-    for label, waveforms, status in _fault_runs(request, hosting, period):
+    for label, waveforms, status in fault_runs(request):
         answer["grid"] += 1
         if waveforms is None:
             answer["rows"] += lost_rows(request, status, "grid", faults=[label])
@@ -90,7 +84,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
             found[label] = waveforms
     for mode in dict.fromkeys(mode for mode, _ in runs) if found else ():
         betas = [beta for m, beta in runs if m == mode]
-        rows = _facility_rows(request, period.name, mode, betas, found, hosting, period.dc_factor)
+        rows = facility_rows(request, mode, betas, found)
         answer["rows"] += rows
         answer["facility"] += len(rows)
     if not request.get("keep", False):
@@ -168,10 +162,14 @@ def prepare(request: Mapping[str, Any]) -> str:
     else:
         _ = grid.native.system.layout  # compiles now
     mode = request["runs"][0][0]
-    simulator = simulator_of(mode, request["parameters"].get(mode, {}), thetas(request))
+    simulator = simulator_of(mode, {}, thetas(request))
     for beta in [beta for m, beta in request["runs"] if m == mode]:
         simulator.dae.parameter_values(
-            H=1.0, beta=beta, d=request["period"]["dc_factor"], pf=float(request["pf"])
+            **request["parameters"].get(mode, {}),
+            H=1.0,
+            beta=beta,
+            d=request["period"]["dc_factor"],
+            pf=float(request["pf"]),
         )
     return simulator.backend
 
@@ -189,10 +187,22 @@ def thetas(request: Mapping[str, Any]) -> tuple[str, ...]:
 # -- the two halves ------------------------------------------------------------------------------------------
 
 
-def _fault_runs(
-    request: Mapping[str, Any], hosting: Mapping[int, float], period: Period
-) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
-    """Label, waveforms by site (None when there are none) and status of every fault."""
+def hosting_of(request: Mapping[str, Any]) -> dict[int, float]:
+    """Hosted capacity by site, MW."""
+    return dict(zip(map(int, request["sites"]), map(float, request["hosting"]), strict=True))
+
+
+def period_of(request: Mapping[str, Any]) -> Period:
+    """Operating period of a request."""
+    from dcvrt.grid import Period
+
+    given = dict(request["period"])
+    wind = {int(bus): mw for bus, mw in given.pop("wind").items()}
+    return Period(wind=wind, **given)
+
+
+def fault_runs(request: Mapping[str, Any]) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
+    """Label, waveforms by site (None when there are none) and status of every fault of a request."""
     from dcvrt.grid import BusFault
 
     labels = {
@@ -201,8 +211,8 @@ def _fault_runs(
     }
     try:
         found = _grid_of(request).waveforms_of(
-            hosting,
-            period,
+            hosting_of(request),
+            period_of(request),
             list(labels),
             until=float(request["t_end_s"]),
             engine=request["engine"],
@@ -217,24 +227,28 @@ def _fault_runs(
     ]
 
 
-def _facility_rows(
+def facility_rows(
     request: Mapping[str, Any],
-    period: str,
     mode: str,
     betas: Sequence[float],
     waveforms: Mapping[str, Mapping[int, Waveform]],
-    hosting: Mapping[int, float],
-    d: float,
 ) -> list[dict[str, Any]]:
-    """One mode at several ratings on the waveforms of all faults, in one batch."""
-    wrt = thetas(request)
-    simulator = simulator_of(mode, request["parameters"].get(mode, {}), wrt)
+    """One mode at several ratings on the waveforms of faults, by label and site, in one batch."""
+    period, d = str(request["period"]["name"]), float(request["period"]["dc_factor"])
+    hosting, wrt = hosting_of(request), thetas(request)
+    simulator = simulator_of(mode, {}, wrt)  # values go with the runs: one simulator serves all of them
     cases = [
         (fault, site, beta) for fault, at_sites in waveforms.items() for site in at_sites for beta in betas
     ]
     result = simulator.batch(
         [waveforms[fault][site] for fault, site, _ in cases],
-        {"H": 1.0, "d": d, "pf": float(request["pf"]), "beta": [beta for *_, beta in cases]},
+        {
+            **request["parameters"].get(mode, {}),
+            "H": 1.0,
+            "d": d,
+            "pf": float(request["pf"]),
+            "beta": [beta for *_, beta in cases],
+        },
         criteria=_criteria(_frozen(request["criteria"])),
     )
     rows = []

@@ -8,11 +8,13 @@ simulator; any other is read and initialised by it.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.errors import DcvrtError, did_you_mean, raise_all
+from dcvrt.errors import DcvrtError, did_you_mean, outside, raise_all
 from dcvrt.planning.replay import fault_label
 from dcvrt.studies.config import (
     CriteriaSection,
@@ -23,9 +25,9 @@ from dcvrt.studies.config import (
     HostingSection,
     PeriodEntry,
     SamplingSection,
+    SensitivitySection,
     StudyFile,
     SystemLimitSection,
-    WhatIfEntry,
     read,
 )
 from dcvrt.studies.ranges import do_not_go_together, outside_ranges
@@ -68,7 +70,7 @@ def check(text: str, where: str, folder: Path) -> StudyFile:
     problems += outside_ranges(sections, year, network)
     if "facility" in sections:
         problems += unknown_variants(sections["facility"])
-        problems += wrong_what_ifs(sections)
+        problems += wrong_sensitivity(sections)
     raise_all(problems, where)
     assert file is not None
     return file
@@ -290,65 +292,58 @@ def unknown_variants(facility: FacilitySection) -> list[str]:
     return list(dict.fromkeys(problems))
 
 
-def wrong_what_ifs(sections: Mapping[str, Any]) -> list[str]:
-    """What-ifs that vary nothing, or what cannot be varied, or to values that cannot be.
-
-    One for a variant that the study leaves out is no mistake: it waits until that variant is studied.
-    """
+def wrong_sensitivity(sections: Mapping[str, Any]) -> list[str]:
+    """A rating that is not studied; ranges of what no variant has, or that cannot be."""
     from dcvrt import facility as variants
+    from dcvrt.planning.sensitivity import CRITERIA
 
+    asked: SensitivitySection | None = sections.get("sensitivity")
     facility: FacilitySection = sections["facility"]
-    grid: GridSection | None = sections.get("grid")
-    entries: Sequence[WhatIfEntry] = sections.get("what_if", ())
-    modes = [mode for mode in facility.modes if mode in variants.names()]
-    tables = {mode: _parameters_of(mode) for mode in modes} if entries else {}
-    labels = [entry.label for entry in entries if entry.label is not None]
-    problems = [f"what_if: the label {label!r} is used more than once." for label in _repeated(labels)]
-    for k, entry in enumerate(entries, start=1):
-        if not entry.parameters and not entry.criteria():
-            problems.append(
-                f"what_if[{k}]: varies nothing. Way out: give parameters, or one of the fields of [criteria]."
-            )
-        problems += [
-            f"what_if[{k}].modes: no variant {mode!r}.{did_you_mean(mode, variants.names())}"
-            for mode in entry.modes or ()
-            if mode not in variants.names()
-        ]
-        if grid is not None:
-            problems += [
-                f"what_if[{k}].{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."
-                for name, value in (("window_ms", entry.window_ms), ("loss_window_ms", entry.loss_window_ms))
-                if value is not None and 1e-3 * value >= grid.t_end_s
-            ]
-        for mode in modes if entry.modes is None else [mode for mode in modes if mode in entry.modes]:
-            problems += _wrong_what_if(f"what_if[{k}].parameters", entry, mode, facility, tables)
-    return list(dict.fromkeys(problems))
-
-
-def _wrong_what_if(
-    table: str,
-    entry: WhatIfEntry,
-    mode: str,
-    facility: FacilitySection,
-    tables: Mapping[str, Mapping[str, Any]],
-) -> list[str]:
-    """What is wrong with the parameters of a what-if on one variant."""
-    having = {path: [m for m in tables if path in tables[m]] for path in entry.parameters}
-    elsewhere = [path for path, found in having.items() if found and mode not in found]
-    problems = [
-        f'{table}."{path}": variant {mode!r} has no such parameter. Way out: modes = {having[path]}.'
-        for path in elsewhere
-    ]
-    here = {path: value for path, value in entry.parameters.items() if path not in elsewhere}
-    problems += _wrong_parameters(table, here, mode, tables[mode])
-    if problems or not entry.parameters:
+    if asked is None:
+        return []
+    problems = []
+    if asked.beta is not None and asked.beta not in facility.beta:
+        problems.append(
+            f"sensitivity.beta = {asked.beta:g}: is not among facility.beta = {facility.beta}. Way out: add "
+            "it there, or leave it out here."
+        )
+    if not asked.ranges:
         return problems
-    studied = facility.parameters | facility.parameters_by_mode.get(mode, {})
-    if do_not_go_together(table, mode, studied):
-        return []  # told where the study sets them
-    return do_not_go_together(table, mode, studied | entry.parameters)
+    studied = [mode for mode in facility.modes if mode in variants.names()]
+    known = _parameters_of_all(studied)
+    if not known.keys() | CRITERIA.keys() >= asked.ranges.keys():  # of a variant that is not studied?
+        known = _parameters_of_all(variants.names())
+    for path, (low, high) in asked.ranges.items():
+        where = f'sensitivity.ranges."{path}"'
+        if path in SHARED:
+            problems.append(f"{where}: is set by the study in every run and is no assumption of a facility.")
+            continue
+        if path not in known and path not in CRITERIA:
+            problems.append(
+                f"{where}: no variant has such a parameter.{did_you_mean(path, [*CRITERIA, *known])}"
+            )
+            continue
+        if not low < high:
+            problems.append(f"{where} = [{low:g}, {high:g}]: the first value must be below the second.")
+            continue
+        bounds, unit = (0.0, math.inf), "1"
+        if path in known:
+            bounds, unit = known[path].bounds, known[path].unit
+        elif path == "criteria.loss_share":
+            bounds = (0.0, 1.0)
+        problems += [
+            f"{where}: {outside(path, end, unit, bounds)}"
+            for end in (low, high)
+            if not bounds[0] <= end <= bounds[1]
+        ]
+    return problems
 
 
+def _parameters_of_all(modes: Sequence[str]) -> dict[str, Any]:
+    return {path: row for mode in modes for path, row in _parameters_of(mode).items()}
+
+
+@lru_cache(maxsize=16)
 def _parameters_of(mode: str) -> dict[str, Any]:
     """Parameters of a variant that a study file may set, by path."""
     from dcvrt import facility as variants

@@ -22,7 +22,6 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 ShareOrAll = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-INSTEAD = "in place of that of [criteria]"
 
 
 class Section(BaseModel):
@@ -210,28 +209,22 @@ class RunSection(Section):
     )
 
 
-class WhatIfEntry(Section):
-    """`[[what_if]]`: other parameters or criteria, to see how the least rating moves with them."""
+class SensitivitySection(Section):
+    """`[sensitivity]`: how far the hosted capacity moves with the assumptions that are illustrative."""
 
-    label: str | None = Field(
-        default=None, min_length=1, description="what tables call it; default: the values themselves"
-    )
-    modes: list[str] | None = Field(
+    beta: Positive | None = Field(
         default=None,
-        min_length=1,
-        description="variants that it is tried on, as far as they are studied; default: all",
+        description="rating whose plan is looked at; default: for each mode, the largest of the plans that a "
+        "margin holds",
     )
-    parameters: dict[str, Finite] = Field(default={}, description="facility parameters, by path")
-    v_it_min_pu: Positive | None = Field(default=None, description=INSTEAD)
-    window_ms: Positive | None = Field(default=None, description=INSTEAD)
-    loss_share: Share | None = Field(default=None, description=INSTEAD)
-    loss_window_ms: NotNegative | None = Field(default=None, description=INSTEAD)
-    voltage_criterion: Literal["sustained", "instantaneous"] | None = Field(default=None, description=INSTEAD)
-
-    def criteria(self) -> dict[str, Any]:
-        """The criteria that it changes, under the names of `[criteria]`."""
-        given = self.model_dump(include=set(CriteriaSection.model_fields))
-        return {name: value for name, value in given.items() if value is not None}
+    change: Share = Field(default=0.2, description="relative change of every assumption, to either side")
+    ranges: dict[str, Annotated[list[Finite], Field(min_length=2, max_length=2)]] = Field(
+        default={},
+        description="lowest and highest value instead, by path, as criteria.loss_share",
+    )
+    reruns: int = Field(
+        default=3, ge=0, description="assumptions per mode for which the frontier is searched again"
+    )
 
 
 class StudyFile(BaseModel):
@@ -251,33 +244,32 @@ class StudyFile(BaseModel):
     frontier: FrontierSection = FrontierSection()
     system_limit: SystemLimitSection = SystemLimitSection()
     replay: ReplaySection = ReplaySection()
+    sensitivity: SensitivitySection = SensitivitySection()
     run: RunSection = RunSection()
     fault: list[FaultEntry] = Field(min_length=1, description="the faults that every site must ride through")
     period: list[PeriodEntry] = Field(min_length=1, description="the hours they are simulated in")
-    what_if: list[WhatIfEntry] = Field(default=[], description="assumptions to vary on the largest plan")
 
     def canonical(self) -> dict[str, Any]:
         """Everything that decides a plan of the study, as plain data: `[run]`, the name, `[system_limit]` and
-        `[[what_if]]` do not.
+        `[sensitivity]` do not.
 
-        System limits and what-ifs are asked once the plans are there, so that a folder may be asked again
-        with others.
+        System limits and sensitivities are asked once the plans are there, so that a folder may be asked
+        again for others.
         """
         data = self.model_dump(mode="json")
-        del data["run"], data["what_if"], data["system_limit"], data["study"]["name"]
+        del data["run"], data["sensitivity"], data["system_limit"], data["study"]["name"]
         return data
 
     def quick(self) -> StudyFile:
         """The same study with less of what takes time, to see within minutes that all of it works.
 
-        Fewer samples, periods, ratings and what-ifs; every fault, site and mode. The numbers are coarser,
+        Fewer samples, periods, ratings and reruns; every fault, site and mode. The numbers are coarser,
         and a folder made this way is not continued by a full run.
         """
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})
         limits = self.system_limit
         near = [min(few, key=lambda b: abs(b - wanted)) for wanted in limits.beta or []]
-        some = sorted({0, len(self.what_if) // 2, len(self.what_if) - 1}) if self.what_if else []
         ends = self.period if len(self.period) < 3 else [self.period[0], self.period[-1]]
         return self.model_copy(
             update={
@@ -285,7 +277,9 @@ class StudyFile(BaseModel):
                 "facility": self.facility.model_copy(update={"beta": few}),
                 "period": ends,
                 "system_limit": limits.model_copy(update={"beta": sorted(set(near)) or None}),
-                "what_if": [self.what_if[k] for k in some],
+                "sensitivity": self.sensitivity.model_copy(
+                    update={"beta": None, "reruns": min(self.sensitivity.reruns, 1)}
+                ),
             }
         )
 
@@ -430,7 +424,7 @@ def _merged(sentences: list[str]) -> list[str]:
 
 
 def _known_fields(name: str) -> list[str]:
-    entry: Any = {"fault": FaultEntry, "period": PeriodEntry, "what_if": WhatIfEntry}.get(
+    entry: Any = {"fault": FaultEntry, "period": PeriodEntry}.get(
         name, StudyFile.model_fields[name].annotation
     )
     return [field for field in entry.model_fields]

@@ -14,9 +14,9 @@ from typing import Any
 
 from dcvrt.planning import coupling
 from dcvrt.studies.campaign import Campaign, Task
+from dcvrt.studies.findings import SAME_SHARE
 from dcvrt.studies.phases import NO_VRT, Setting
 from dcvrt.studies.store import Store, records
-from dcvrt.studies.what_if import largest_passed
 
 PHASE = "coupling"
 Run = tuple[str, str, float]
@@ -54,6 +54,29 @@ def run_coupling(campaign: Campaign, setting: Setting) -> list[str]:
     if closed:
         _refuse(store, plans)
     return lost
+
+
+def largest_passed(store: Store, setting: Setting) -> dict[str, dict[str, Any]]:
+    """The plan of each mode with the largest total that passed replay and power flow; of equal ones, that of
+    the smallest rating. Modes without such a plan are left out."""
+    same = SAME_SHARE * max(setting.no_vrt.total_mw, 1.0)
+    plans = [
+        plan
+        for plan in records(store.plans())
+        if plan["method"] != NO_VRT
+        and plan["passed"] == 1
+        and plan["ac_passed"] == 1
+        and plan["total_mw"] > 0
+    ]
+    largest = {}
+    for mode in setting.file.facility.modes:
+        here = [plan for plan in plans if plan["mode"] == mode]
+        if here:
+            most = max(plan["total_mw"] for plan in here)
+            largest[mode] = min(
+                (plan for plan in here if plan["total_mw"] >= most - same), key=lambda plan: plan["beta"]
+            )
+    return largest
 
 
 def _refuse(store: Store, plans: list[dict[str, Any]]) -> None:

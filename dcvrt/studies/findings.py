@@ -123,10 +123,15 @@ class Findings:
             return system_limits(store)
 
     @cached_property
-    def what_ifs(self) -> pd.DataFrame:
-        """Least ratings of the largest plans under varied assumptions."""
+    def sensitivities(self) -> pd.DataFrame:
+        """Sensitivities of one plan of each mode to the assumptions, those with most at stake first."""
         with self._store() as store:
-            return store.what_ifs()
+            return store.sensitivities()
+
+    @cached_property
+    def sensitivity_plans(self) -> dict[str, dict[str, Any]]:
+        """The plans that the sensitivities belong to, by mode."""
+        return dict(self.provenance.get("sensitivity_plans", {}))
 
     @cached_property
     def coupling(self) -> pd.DataFrame:

@@ -1,5 +1,5 @@
 """What a study folder holds for people and programs, made from the store alone: summary.json, table.csv,
-validation.csv, coupling.csv, frontier.json.
+validation.csv, coupling.csv, frontier.json, sensitivity.json.
 
 Each file is written beside itself and then moved into place: a file that is there is whole.
 """
@@ -23,7 +23,7 @@ from dcvrt.studies.system_limit import system_limits
 if TYPE_CHECKING:
     import pandas as pd
 
-FRONTIER, COUPLING = "frontier.json", "coupling.csv"
+COUPLING, FRONTIER, SENSITIVITY = "coupling.csv", "frontier.json", "sensitivity.json"
 SYSTEM_KEYS = (
     "mode", "beta", "limit", "limit_mw", "limit_share", "total_mw", "by_site", "passed", "ac_passed",
     "aggregate_loss_mw", "lost_whole", "price_mw_per_mw",
@@ -84,8 +84,22 @@ def write_results(folder: Path, store: Store) -> list[Path]:
             )
             + "\n",
         ),
+        write_atomically(
+            folder / SENSITIVITY, json.dumps(_clean(sensitivity(store)), indent=2, allow_nan=False) + "\n"
+        ),
         write_atomically(folder / SUMMARY, json.dumps(summary(store), indent=2, allow_nan=False) + "\n"),
     ]
+
+
+def sensitivity(store: Store) -> dict[str, Any]:
+    """Sensitivities of one plan of each mode: the plans, the assumptions with most at stake first, and what
+    was simulated for them."""
+    known = store.provenance()
+    return {
+        "plans": known.get("sensitivity_plans", {}),
+        "rows": records(store.sensitivities()),
+        "simulations": known.get("sensitivity_runs", {"grid": 0, "facility": 0}),
+    }
 
 
 def summary(store: Store) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from dcvrt.planning.requirement import SystemLimit
 from dcvrt.planning.sampling import Samples, sample_hosting
 from dcvrt.planning.surrogate import TARGETS, MarginData, Surrogate, fit_surrogates
 from dcvrt.planning.sweep import sweep
+from dcvrt.studies import checks
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.store import Store, records
@@ -48,14 +50,17 @@ class Setting:
     folder : what relative paths in it start from.
     problem : hosting programme; its cuts are kept from one solve to the next.
     periods : {name: {name, hour, load_scale, wind, dc_factor}}.
-    no_vrt : plan without ride-through.
     """
 
     file: StudyFile
     folder: Path
     problem: HostingProblem
     periods: dict[str, dict[str, Any]]
-    no_vrt: Plan
+
+    @cached_property
+    def no_vrt(self) -> Plan:
+        """The plan without ride-through."""
+        return self.problem.solve()
 
     @property
     def sites(self) -> tuple[int, ...]:
@@ -132,6 +137,36 @@ class Setting:
     def runs(self) -> list[tuple[str, float]]:
         """Every mode at every rating."""
         return [(mode, beta) for mode in self.file.facility.modes for beta in self.file.facility.beta]
+
+
+def setting_of(file: StudyFile, folder: Path) -> Setting:
+    """Hosting programme and periods of a study whose relative paths start from a folder."""
+    network, problems = checks.read_network(file.grid, folder)
+    if network is None:
+        raise InputError("; ".join(problems))
+    h = file.hosting
+    year = checks.profiles_of(h, folder)
+    problem = HostingProblem(
+        network,
+        tuple(file.grid.sites),
+        year,
+        rating_scale=h.rating_scale,
+        voltage=(h.v_min_pu, h.v_max_pu),
+        pf=h.pf,
+        reactive_limits=h.reactive_limits,
+    )
+    chosen = year.representative(network)
+    periods = {}
+    for entry in file.period:
+        hour = year.at(chosen[entry.hour] if isinstance(entry.hour, str) else entry.hour)
+        periods[entry.name] = {
+            "name": entry.name,
+            "hour": hour.hour,
+            "load_scale": hour.load,
+            "dc_factor": hour.dc,
+            "wind": {str(bus): mw for bus, mw in hour.wind.items()},
+        }
+    return Setting(file, folder, problem, periods)
 
 
 def criteria(file: StudyFile) -> dict[str, Any]:

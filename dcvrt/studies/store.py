@@ -50,12 +50,13 @@ binding and
                passed, n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses
                (JSON), one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole);
                search as in `plans`.
-`what_ifs`     least rating of the largest plan of a mode that passed, under varied assumptions: mode, number
-               (0: as studied; else the place in the study file's `what_if`), label, changes (JSON: name,
-               unit, studied, varied); method, beta, hosting, total_mw of the plan; n_waveforms it was run on;
-               low and high, between which it was searched; rating (NULL when high is not enough). Derived
-               from the waveforms of the replays, written as a whole and anew when its inputs change:
-               `what_ifs_from` in `provenance` is their digest.
+`sensitivities` of one plan of each mode: mode, number (most at stake first), path, unit, doc, source, value;
+               by_unit: MW per unit by gradients, NULL where no margin holds the plan; sides (JSON, low and
+               high: value, linear_mw (to first order), gradient_mw (through the hosting programme), refused,
+               unseen {bus: what fails that gradients do not see}, stake_mw, rerun_mw, rerun_by_site,
+               rerun_settled); stake_mw. Derived from the plans and written as a whole;
+               `sensitivities_from` in `provenance` is their digest, `sensitivity_plans` says of which plans
+               they are and `sensitivity_runs` what was simulated for them.
 `coupling`     margins of plans with the facilities in the network ('closed') beside those without ('open'),
                by the native engine: hosting, mode, beta, period, fault, site; v_poi_min_open and _closed
                (pu), voltage_ (margin, pu), loss_ (margin, share of load), passed_; same_sequence; status,
@@ -129,10 +130,9 @@ TABLES = {
     "ac_status TEXT, worst TEXT NOT NULL DEFAULT '{}', replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
     "n_failed INTEGER NOT NULL DEFAULT 0, aggregate_loss_mw REAL, losses TEXT NOT NULL DEFAULT '[]', "
     "search TEXT NOT NULL, PRIMARY KEY (mode, beta, limit_mw, limit_share)",
-    "what_ifs": "mode TEXT NOT NULL, number INTEGER NOT NULL, label TEXT NOT NULL, changes TEXT NOT NULL, "
-    "method TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
-    "n_waveforms INTEGER NOT NULL, low REAL NOT NULL, high REAL NOT NULL, rating REAL, "
-    "PRIMARY KEY (mode, number)",
+    "sensitivities": "mode TEXT NOT NULL, number INTEGER NOT NULL, path TEXT NOT NULL, unit TEXT NOT NULL, "
+    "doc TEXT NOT NULL, source TEXT NOT NULL, value REAL NOT NULL, by_unit REAL, sides TEXT NOT NULL, "
+    "stake_mw REAL NOT NULL, PRIMARY KEY (mode, path)",
     "coupling": "hosting TEXT NOT NULL, mode TEXT NOT NULL, beta REAL NOT NULL, period TEXT NOT NULL, "
     "fault TEXT NOT NULL, site INTEGER NOT NULL, v_poi_min_open REAL, v_poi_min_closed REAL, "
     "voltage_open REAL, voltage_closed REAL, loss_open REAL, loss_closed REAL, passed_open INTEGER, "
@@ -149,8 +149,8 @@ JSON_COLUMNS = {
     "gradients",
     "worst",
     "search",
-    "changes",
     "losses",
+    "sides",
 }
 
 
@@ -354,9 +354,9 @@ class Store:
         """Every plan under a system limit."""
         return self._frame("system_plans", order="mode, beta, limit_share, limit_mw")
 
-    def what_ifs(self) -> pd.DataFrame:
-        """Least ratings under varied assumptions, by mode; number 0 is the study as it is."""
-        return self._frame("what_ifs", order="mode, number")
+    def sensitivities(self) -> pd.DataFrame:
+        """Sensitivities of one plan of each mode to the assumptions, those with most at stake first."""
+        return self._frame("sensitivities", order="mode, number")
 
     def coupling(self) -> pd.DataFrame:
         """Margins of plans with the facilities in the network beside those without."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, coupling, frontier, outputs, phases, what_if
+from dcvrt.studies import checks, config, coupling, frontier, outputs, phases, sensitivity
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
@@ -82,7 +82,7 @@ class Study:
         out : folder; default "NAME-results" or "NAME-quick" here. A folder of the same study is resumed.
         workers : processes on this machine.
         scheduler : address of a dask scheduler to use instead.
-        quick : fewer samples, periods, ratings and what-ifs, for a look at the whole chain.
+        quick : fewer samples, periods, ratings and reruns, for a look at the whole chain.
         retry : do once more what was set aside.
         reporter : shows progress.
 
@@ -108,7 +108,7 @@ class Study:
         if (folder / outputs.STORE).is_file():
             with Store(folder / outputs.STORE) as store:
                 refuse_another_study(store, file, folder)
-        setting = self._setting(file)
+        setting = self.setting(file)
         reporter.say(f"without ride-through: {setting.no_vrt.total_mw:.2f} MW")
         backends = prepare(file, setting)
         for mode, backend in backends.items():
@@ -133,7 +133,7 @@ class Study:
                     lost += phases.run_replays(campaign, setting)
                     lost += coupling.run_coupling(campaign, setting)
                     frontier.run_mechanisms(store, setting)
-                    what_if.run_what_ifs(store, setting, reporter)
+                    lost += sensitivity.run_sensitivity(campaign, setting, reporter)
                 finally:
                     store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
                 outputs.write_results(folder, store)
@@ -141,36 +141,9 @@ class Study:
         result.report()
         return result
 
-    def _setting(self, file: StudyFile) -> phases.Setting:
-        """Hosting programme, periods and the plan without ride-through."""
-        from dcvrt.planning.hosting import HostingProblem
-
-        network, problems = checks.read_network(file.grid, self.folder)
-        if network is None:
-            raise InputError("; ".join(problems))
-        h = file.hosting
-        year = checks.profiles_of(h, self.folder)
-        problem = HostingProblem(
-            network,
-            tuple(file.grid.sites),
-            year,
-            rating_scale=h.rating_scale,
-            voltage=(h.v_min_pu, h.v_max_pu),
-            pf=h.pf,
-            reactive_limits=h.reactive_limits,
-        )
-        chosen = year.representative(network)
-        periods = {}
-        for entry in file.period:
-            hour = year.at(chosen[entry.hour] if isinstance(entry.hour, str) else entry.hour)
-            periods[entry.name] = {
-                "name": entry.name,
-                "hour": hour.hour,
-                "load_scale": hour.load,
-                "dc_factor": hour.dc,
-                "wind": {str(bus): mw for bus, mw in hour.wind.items()},
-            }
-        return phases.Setting(file, self.folder, problem, periods, problem.solve())
+    def setting(self, file: StudyFile | None = None) -> phases.Setting:
+        """Hosting programme and periods of the study, or of a variation of its file."""
+        return phases.setting_of(self.file if file is None else file, self.folder)
 
     def _note(self, store: Store, file: StudyFile, setting: phases.Setting, quick: bool) -> None:
         """Write down what the study is and what it is made with."""

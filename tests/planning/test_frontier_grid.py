@@ -28,7 +28,7 @@ def test_twenty_sites_are_searched_and_pass() -> None:
             "fault": [fault for fault in study.file.fault if fault.bus in (25, 80, 107)],
         }
     )
-    setting = study._setting(file)
+    setting = study.setting(file)
     (period,) = setting.periods
     labels = [replay.fault_label(fault.model_dump()) for fault in file.fault]
 

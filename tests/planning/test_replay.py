@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dcvrt.planning.replay import _facility_rows, fault_label, lost_rows, modes_passed, verdict
+from dcvrt.planning.replay import facility_rows, fault_label, lost_rows, modes_passed, verdict
 
 REQUEST = {
     "sites": [21, 75],
@@ -124,9 +124,10 @@ def test_rows_keep_the_loading_before_the_fault() -> None:
 
     sag = Waveform.sag(retained=0.8, start=0.1, length=0.1, until=0.4)
     request = {"parameters": {}, "pf": 0.98, "criteria": {}, "gradients": False}
+    request |= {"sites": [21], "hosting": [30.0], "period": {"name": "peak", "dc_factor": 1.0}}
     ratings = [1.01, 1.2]
     waveforms = {"bus 32, 100 ms": {21: sag}}
-    rows = _facility_rows(request, "peak", "gfl", ratings, waveforms, {21: 30.0}, 1.0)
+    rows = facility_rows(request, "gfl", ratings, waveforms)
     preload = [r["diagnostics"]["preload"] for r in rows]
     assert preload[0] == pytest.approx(1.0, abs=1e-3)  # 1/0.98 would be needed
     assert preload[1] == pytest.approx(1 / (0.98 * 1.2), rel=1e-4)

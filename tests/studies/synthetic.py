@@ -14,9 +14,9 @@ import numpy as np
 
 from dcvrt.planning import replay
 from dcvrt.planning.sampling import sample_hosting
-from dcvrt.studies import outputs, phases, what_if
+from dcvrt.studies import outputs, phases
 from dcvrt.studies.config import StudyFile, load
-from dcvrt.studies.store import Store
+from dcvrt.studies.store import Store, records
 
 SITES = (21, 75, 106, 108)
 CORNER = (31.4, 153.9, 102.4, 104.1)
@@ -153,7 +153,7 @@ def make(
             _lose(store, file)
         phases.run_fits(store, setting)  # type: ignore[arg-type]
         _plans(store, file, failing)
-        _what_ifs(store, file)
+        _sensitivities(store, file)
         outputs.write_results(folder, store)
     return folder
 
@@ -267,36 +267,69 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
         _waveforms(store, file, plan, rows)
 
 
-def _what_ifs(store: Store, file: StudyFile) -> None:
-    """Least ratings by the static law, and made-up ones of a parameter; one that no rating makes up for."""
-    setting = SimpleNamespace(file=file, no_vrt=SimpleNamespace(total_mw=sum(CORNER)))
-    for mode, plan in what_if.largest_passed(store, setting).items():  # type: ignore[arg-type]
-        H = np.array([plan["by_site"][str(site)] for site in SITES])
-        least = min(
-            retained(fault, site, H, d)
-            for fault in LEAST
-            for k, site in enumerate(SITES)
-            if H[k] > 0
-            for _, _, d, _ in PERIODS.values()
-        )
-        studied = (1.0 - file.criteria.loss_share) / least
-        share = {"name": "criteria.loss_share", "unit": "1", "studied": file.criteria.loss_share}
-        gain = {"name": "dc_loop.K_p", "unit": "1", "studied": 1.0, "varied": 2.0}
-        asked: list[tuple[str, list[dict[str, Any]], float | None]] = [
-            ("as studied", [], studied),
-            ("loss <share> 20 %", [share | {"varied": 0.2}], 0.8 / least),
-            ("loss share 1 %", [share | {"varied": 0.01}], None),
-            ("twice the gain of the $DC$ loop_", [gain], studied + 0.05),
+def _sensitivities(store: Store, file: StudyFile) -> None:
+    """One plan that a margin holds, with made-up effects, and one that the network alone holds."""
+    plans = {}
+    for mode in file.facility.modes:
+        hosting = [p for p in records(store.plans()) if p["mode"] == mode and p["total_mw"] > 0]
+        if not hosting:
+            continue
+        plan = hosting[0]
+        margin = {"period": "peak", "fault": "bus 111, 100 ms", "site": 108, "target": "loss"}
+        held = mode == "gfm"
+        plans[mode] = {
+            "beta": plan["beta"],
+            "hosting": plan["hosting"],
+            "total_mw": plan["total_mw"],
+            "by_site": plan["by_site"],
+            "binding": [margin | {"label": "loss", "price": 1200.0, "by_beta": 700.0}] if held else [],
+            "by_sequence": [],
+            "limits": ["line 80-99"],
+            "closed": {},
+            "near": [],
+            "rerun_mw": plan["total_mw"] + 0.2 if held else None,
+        }
+        share = {"path": "criteria.loss_share", "doc": "largest loss of import", "value": 0.10}
+        gain = {"path": "dc_loop.K_p", "doc": "proportional gain over H", "value": 1.0}
+        deep = {"path": "sup.V_deep", "doc": "deep dip below", "value": 0.5}
+        common = {"mode": mode, "unit": "1", "source": "illustrative"}
+        rows = [
+            share
+            | {"by_unit": 1200.0, "sides": {"low": _end(0.08, -24.0, -24.5), "high": _end(0.12, 24.0, 11.0)}},
+            deep | {"by_unit": 0.0, "sides": {"low": _end(0.4, 0.0), "high": _end(0.6, 0.0, unseen=True)}},
+            gain | {"by_unit": -3.0, "sides": {"low": _end(0.8, 0.6), "high": _end(1.2, refused="no <gap>")}},
+            {"path": "sup.T_dip", "doc": "shallow dip tolerated", "value": 0.25, "by_unit": 0.0}
+            | {"sides": {"low": _end(0.2, 0.0), "high": _end(0.3, 0.0)}},
         ]
-        for number, (label, changes, rating) in enumerate(asked if mode == "gfm" else asked[:3]):
+        for number, row in enumerate(rows, start=1):
+            sides = row["sides"] if held else {side: _end(end["value"]) for side, end in row["sides"].items()}
+            by_unit = row["by_unit"] if held else None
+            for end in sides.values():
+                if end["rerun_mw"] is not None:  # changes are given; the store holds totals
+                    end["rerun_mw"] += plans[mode]["rerun_mw"]
+            stake = max(end["stake_mw"] for end in sides.values())
             store.put(
-                "what_ifs",
-                [
-                    {"mode": mode, "number": number, "label": label, "changes": changes}
-                    | {name: plan[name] for name in ("method", "beta", "hosting", "total_mw")}
-                    | {"n_waveforms": 8, "low": what_if.LOW, "high": what_if.HIGH, "rating": rating}
-                ],
+                "sensitivities",
+                [common | row | {"sides": sides, "by_unit": by_unit, "number": number, "stake_mw": stake}],
             )
+    store.note(sensitivity_plans=plans, sensitivity_runs={"grid": 12, "facility": 345})
+
+
+def _end(
+    value: float, mw: float | None = None, again: float | None = None, unseen: bool = False, refused: str = ""
+) -> dict[str, Any]:
+    """One end of a range; `again`: the change that a search has found."""
+    return {
+        "value": value,
+        "linear_mw": mw,
+        "gradient_mw": mw,
+        "refused": refused,
+        "unseen": {"106": "fault bus 94, 100 ms, peak: the <link> collapsed"} if unseen else {},
+        "stake_mw": 50.0 if unseen else abs(mw or 0.0),
+        "rerun_mw": again,
+        "rerun_by_site": {},
+        "rerun_settled": None if again is None else True,
+    }
 
 
 def _plan(

@@ -48,8 +48,8 @@ def test_quick_keeps_faults_sites_and_modes() -> None:
     assert len(quick.period) < len(file.period)
     assert set(quick.facility.beta) < set(file.facility.beta)
     assert quick.facility.beta[-1] == file.facility.beta[-1]
-    assert len(quick.what_if) == 3
-    assert all(entry in file.what_if for entry in quick.what_if)
+    assert (quick.sensitivity.reruns, file.sensitivity.reruns) == (1, 3)
+    assert quick.sensitivity.ranges == file.sensitivity.ranges
     checks.check(config.template(), "quick", HERE)
     assert not checks.contradictions({name: getattr(quick, name) for name in config.StudyFile.model_fields})
 
@@ -62,11 +62,11 @@ def test_the_canonical_form_leaves_out_what_decides_nothing() -> None:
     )
     reseeded = config.load(changed(("seed = 1", "seed = 2")), "a")
     asked = config.load(
-        changed(("loss_share = 0.20", "loss_share = 0.21"), ("loss_mw = [0.0, ", "loss_mw = [0.0, 7.5, ")),
+        changed(("reruns = 3", "reruns = 2"), ("loss_mw = [0.0, ", "loss_mw = [0.0, 7.5, ")),
         "a",
     )
     assert file.canonical() == renamed.canonical() == asked.canonical() != reseeded.canonical()
-    assert file.what_if != asked.what_if
+    assert file.sensitivity != asked.sensitivity
 
 
 def test_schema_is_json_and_knows_every_table() -> None:
@@ -86,8 +86,8 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
     assert complaint(text) == (
         "my.toml: 7 problems\n"
         "  runn: unknown table. Did you mean 'run'? Known: study, grid, hosting, facility, criteria, "
-        "sampling, surrogate, frontier, system_limit, replay, run, "
-        "fault, ... (14 in all).\n"
+        "sampling, surrogate, frontier, system_limit, replay, sensitivity, "
+        "run, ... (14 in all).\n"
         "  grid.sites[1] = 'a': must be a whole number.\n"
         "  grid.sitez: unknown field. Did you mean 'sites'? Known: case, dynamics, sites, engine, coupling, "
         "t_end_s, step_s, redispatch.\n"
@@ -186,74 +186,46 @@ def test_parameter_out_of_bounds_and_unknown() -> None:
     )
 
 
-def test_what_ifs_that_can_vary_nothing_are_told_all_at_once() -> None:
+def test_sensitivities_that_cannot_be_are_told_all_at_once() -> None:
     text = changed(
+        ("# beta = 1.15 ", "beta = 1.16 #"),
         (
-            "[[what_if]]",
-            """[[what_if]]
-label = "nothing"
-
-[[what_if]]
-label = "nothing"
-loss_window_ms = 2000.0
-
-[[what_if]]
-modes = ["gfm", "gfx"]
-parameters = { "lag.tau" = 0.003 }
-
-[[what_if]]
-parameters = { "sup.V_back" = 0.88, "sup.V_calm" = 1.09 }
-modes = ["gfl"]
-
-[[what_if]]
-parameters = { "vsm.D" = 600.0, "beta" = 1.2 }
-modes = ["gfm"]
-
-[[what_if]]""",
-        )
+            '"vsm.D" = [24.0, 36.0]',
+            """"vsm.D" = [24.0, 600.0]
+"vsm.H_w" = [0.1, 0.2]
+"bess.P_dis" = [0.5, 0.4]
+"criteria.loss_share" = [0.2, 1.2]
+"pf" = [0.95, 1.0]""",
+        ),
     )
-    assert complaint(text) == (
-        "my.toml: 7 problems\n"
-        "  what_if: the label 'nothing' is used more than once.\n"
-        "  what_if[1]: varies nothing. Way out: give parameters, or one of the fields of [criteria].\n"
-        "  what_if[2].loss_window_ms = 2000: is longer than the simulation of 2 s.\n"
-        f"  what_if[3].modes: no variant 'gfx'. Did you mean 'gfm'? Known: {', '.join(facility.names())}.\n"
-        "  what_if[4].parameters: gfl: sup: 'NORMAL -> MIXED: v_f < V_dip or v_f > V_swell or w < w_sag' "
-        "and 'MIXED -> NORMAL: v_f > V_back and v_f < V_calm and w > w_back held T_mixed' leave no gap "
-        "between them (V_dip = 0.9, V_back = 0.88): the modes would chatter. Set the limit of the way back "
-        "beyond that of the way out.\n"
-        '  what_if[5].parameters."vsm.D" = 600 1: is outside [0, 500].\n'
-        '  what_if[5].parameters."beta": is set by the study in every run and cannot be fixed here.'
+    found = complaint(text).splitlines()
+    known = found.pop(3)
+    assert known.startswith(
+        "  sensitivity.ranges.\"vsm.H_w\": no variant has such a parameter. Did you mean 'vsm.H_v'? Known: "
+        "criteria.v_it_min_pu, criteria.window_ms, criteria.loss_share, criteria.loss_window_ms, "
     )
+    assert found == [
+        "my.toml: 6 problems",
+        "  sensitivity.beta = 1.16: is not among facility.beta = [1.0, 1.05, 1.1, 1.125, 1.15, 1.175, 1.2, "
+        "1.25, 1.3, 1.35, 1.4, 1.5]. Way out: add it there, or leave it out here.",
+        '  sensitivity.ranges."vsm.D": vsm.D = 600 is outside [0, 500].',
+        '  sensitivity.ranges."bess.P_dis" = [0.5, 0.4]: the first value must be below the second.',
+        '  sensitivity.ranges."criteria.loss_share": criteria.loss_share = 1.2 is outside [0, 1].',
+        '  sensitivity.ranges."pf": is set by the study in every run and is no assumption of a facility.',
+    ]
 
 
-def test_a_what_if_names_the_variant_without_its_parameter() -> None:
-    found = complaint(
-        changed(('modes = ["gfm"]\nparameters = { "vsm.D" = 15.0 }', 'parameters = { "vsm.D" = 15.0 }'))
-    )
-    assert found == (
-        "my.toml: what_if[9].parameters.\"vsm.D\": variant 'gfl' has no such parameter. Way out: "
-        "modes = ['gfm']."
-    )
-    found = complaint(changed(('"vsm.H_v" = 0.15', '"vsm.H_w" = 0.15')))
-    assert found.startswith(
-        "my.toml: what_if[12].parameters.\"vsm.H_w\": variant 'gfm' has no such parameter. Did you mean "
-        "'vsm.H_v'? Known: "
-    )
-
-
-def test_a_what_if_of_a_variant_that_is_not_studied_waits() -> None:
+def test_a_range_of_a_variant_that_is_not_studied_waits() -> None:
     text = changed(('modes = ["gfl", "gfm"]', 'modes = ["gfl"]'))
-    assert any(entry.modes == ["gfm"] for entry in checks.check(text, "my.toml", HERE).what_if)
+    assert "vsm.X_v" in checks.check(text, "my.toml", HERE).sensitivity.ranges
 
 
-def test_fields_of_a_what_if_are_told_with_their_place() -> None:
-    text = changed(('label = "loss share 20 %"\nloss_share = 0.20', 'lable = "x"\nloss_share = 1.2'))
+def test_fields_of_the_sensitivities_are_told_with_their_place() -> None:
+    text = changed(("reruns = 3", "rerun = 3"), ("change = 0.2 ", "change = 1.2 "))
     assert complaint(text) == (
         "my.toml: 2 problems\n"
-        "  what_if[1].loss_share = 1.2: must be below 1.\n"
-        "  what_if[1].lable: unknown field. Did you mean 'label'? Known: label, modes, parameters, "
-        "v_it_min_pu, window_ms, loss_share, loss_window_ms, voltage_criterion."
+        "  sensitivity.change = 1.2: must be below 1.\n"
+        "  sensitivity.rerun: unknown field. Did you mean 'reruns'? Known: beta, change, ranges, reruns."
     )
 
 

@@ -12,7 +12,16 @@ import pytest
 from dcvrt import facility
 from dcvrt.errors import InputError
 from dcvrt.grid.network import Network
-from dcvrt.studies.figures import capacity, draw_all, faults, layout, supervisor, validation, what_if, worst
+from dcvrt.studies.figures import (
+    capacity,
+    draw_all,
+    faults,
+    layout,
+    sensitivity,
+    supervisor,
+    validation,
+    worst,
+)
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.rows import by_site, closed, verdict
 from dcvrt.studies.store import Store
@@ -31,7 +40,7 @@ NAMES = {
     "internal_response_gfl",
     "internal_response_gfm",
     "supervisor",
-    "what_if",
+    "sensitivity",
 }
 
 
@@ -90,7 +99,7 @@ def test_no_text_is_smaller_than_can_be_read_in_print(folder: Path) -> None:
             capacity.draw_allocation(findings),
             validation.draw(findings),
             faults.draw(findings),
-            what_if.draw(findings),
+            sensitivity.draw(findings),
         ):
             assert min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text()) >= 6.0
 
@@ -204,30 +213,39 @@ def test_retained_voltage_is_the_one_of_the_store(folder: Path) -> None:
             assert (row["min"], row["max"]) == pytest.approx((min(volts), max(volts)), abs=1e-12)
 
 
-def test_bars_of_the_assumptions_reach_from_the_studied_rating_to_the_varied_one(folder: Path) -> None:
+def test_bars_are_what_gradients_say_and_diamonds_what_a_search_found(folder: Path) -> None:
     findings = Findings(folder)
     with styled():
-        figure = what_if.draw(findings)
+        figure = sensitivity.draw(findings)
     assert figure is not None
-    for axes, mode in zip(figure.axes, findings.modes, strict=True):
-        base, varied = what_if.rows_of(findings, mode)
-        assert base is not None
-        labels = [t.get_text() for t in axes.get_yticklabels()]
-        bars = dict(zip(labels, axes.patches, strict=True))
-        for row in varied:
-            bar = bars[row["label"]]
-            ends = sorted([bar.get_x(), bar.get_x() + bar.get_width()])
-            end = axes.get_xlim()[1] if row["rating"] is None else row["rating"]
-            assert ends == pytest.approx(sorted([base["rating"], end]))
-        assert labels[0] == "loss share 1 %", "what no rating makes up for stands on top"
-        assert "none up to 2" in texts_of(axes)
+    (axes,) = figure.axes  # with grid-following control the network holds the plan, and nothing is at stake
+    rows = sensitivity.drawn(findings, "gfm")
+    assert [row["path"] for row in rows] == ["criteria.loss_share", "sup.V_deep", "dc_loop.K_p"]
+    bars = {(round(bar.get_y() + bar.get_height() / 2, 2), bar.get_width()) for bar in axes.patches}
+    assert bars == {(-0.19, -24.0), (0.19, 24.0), (0.81, 0.0), (1.81, 0.6)}
+    marks = {
+        (line.get_marker(), round(float(line.get_ydata()[0]), 2)): float(line.get_xdata()[0])
+        for line in axes.lines
+        if line.get_marker() in ("D", "x")
+    }
+    assert marks == pytest.approx({("D", -0.19): -24.5, ("D", 0.19): 11.0, ("x", 1.19): 0.0})
+    assert axes.get_yticklabels()[0].get_text() == "criteria.loss_share = 0.08 … 0.12"
 
 
-def test_without_what_ifs_there_is_no_such_figure(tmp_path: Path) -> None:
+def test_what_gradients_cannot_see_is_no_bar_of_no_length() -> None:
+    blind = {"gradient_mw": 0.0, "refused": "", "unseen": {"21": "events"}}
+    assert sensitivity.by_gradient(blind) is None
+    assert sensitivity.by_gradient(blind | {"unseen": {}}) == 0.0
+    assert sensitivity.by_gradient(blind | {"gradient_mw": -9.0}) == -9.0
+    assert sensitivity.by_gradient(blind | {"gradient_mw": 3.0, "refused": "cannot be"}) is None
+    assert sensitivity.by_gradient(blind | {"gradient_mw": None, "unseen": {}}) is None
+
+
+def test_without_sensitivities_there_is_no_such_figure(tmp_path: Path) -> None:
     make(tmp_path)
     with Store(tmp_path / "study.sqlite", write=True) as store:
-        store.clear("what_ifs")
-    assert what_if.draw(Findings(tmp_path)) is None
+        store.clear("sensitivities")
+    assert sensitivity.draw(Findings(tmp_path)) is None
 
 
 def test_rating_line_is_the_static_loss_law() -> None:

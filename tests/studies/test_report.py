@@ -253,47 +253,48 @@ def test_assumptions_name_what_is_illustrative_and_the_modes_differences(page: P
     assert "Positive sequence only." in page.text
 
 
-def test_the_least_rating_stands_beside_every_assumption_that_was_varied(
-    folder: Path, page: Page, source: str
-) -> None:
+def test_every_assumption_stands_with_gradient_and_search(page: Page) -> None:
     assert "How the answer moves with the assumptions" in page.text
-    section = source[source.index('id="what-if"') :]
-    for row in Findings(folder).what_ifs.to_dict("records"):
-        if row["number"]:
-            assert html.escape(row["label"]) in section
-            if row["rating"] == row["rating"]:
-                assert f">{row['rating']:.3f}<" in section
-    rows = {(row["mode"], row["number"]): row for row in Findings(folder).what_ifs.to_dict("records")}
-    change = rows["gfm", 1]["rating"] - rows["gfm", 0]["rating"]
     assert (
-        f"loss <share> 20 % criteria.loss_share = 0.1 0.2 {rows['gfm', 0]['rating']:.3f} "
-        f"{rows['gfm', 1]['rating']:.3f} {change:+.3f}"
+        "criteria.loss_share: largest loss of import 0.1 0.08 / 0.12 1.2e+03 -24.0 / +24.0 -24.5 / +11.0 –"
     ) in page.text
-    assert "GFM: no rating up to 2 makes up for 'loss share 1 %'." in page.text
-    assert "twice the gain of the $DC$ loop_ dc_loop.K_p = 1 2 " in page.text
+    assert (
+        "sup.V_deep: deep dip below 0.5 0.4 / 0.6 0 0 / – – / – high: bus 106 fails: fault bus 94, 100 ms, "
+        "peak: the <link> collapsed"
+    ) in page.text
+    assert "dc_loop.K_p: proportional gain over H 1 0.8 / 1.2 -3 +0.6 / – – / – high: no <gap>" in page.text
+    assert "GFM: 1 assumptions that move nothing at first order" in page.text
+    assert "Gradients and search agree to a tenth at 1 of 2 ends searched again." in page.text
+    assert (
+        "loss at bus 108, fault bus 111, 100 ms, peak (1200 MW per share, +7.0 MW per 0.01 of β)" in page.text
+    )
+    assert "(12 fault simulations and 345 facility runs in all)" in page.text
+
+
+def test_a_plan_that_the_network_holds_has_no_zeros_for_findings(page: Page) -> None:
+    assert (
+        "is held by no margin, so there is no MW per unit: it is left out, not zero. What holds it: "
+        "line 80-99. No margin is near."
+    ) in page.text
+    assert "GFL: 4 assumptions" in page.text
 
 
 def test_parameters_that_differ_by_mode_lead_to_their_effect(page: Page) -> None:
     assert (
         "How the answer moves with dc_loop.K_p: see How the answer moves with the assumptions ." in page.text
     )
-    assert "The effect of dc_loop.K_i was not studied; a [[what_if]] in the study file adds it." in page.text
-    assert "#what-if" in [attributes["href"] for attributes in page.all("a")]
+    assert "The effect of dc_loop.K_i was not studied; a range in [sensitivity.ranges] adds it." in page.text
+    assert "#sensitivity" in [attributes["href"] for attributes in page.all("a")]
 
 
-def test_without_what_ifs_or_without_a_plan_the_report_says_so(tmp_path: Path, folder: Path) -> None:
+def test_without_a_plan_of_the_frontier_the_report_says_so(tmp_path: Path, folder: Path) -> None:
     make(tmp_path)
     with Store(tmp_path / "study.sqlite", write=True) as store:
-        store.clear("what_ifs")
+        store.clear("sensitivities")
+        store.note(sensitivity_plans={})
     text = page_of(tmp_path, folder).text
-    assert "No assumption was varied: the study has no [[what_if]]." in text
-    with Store(tmp_path / "study.sqlite", write=True) as store:
-        store.put("plans", [plan | {"passed": 0} for plan in store.plans().to_dict("records")])
-        outputs.write_results(tmp_path, store)
-    write_report(tmp_path)
-    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     for mode in ("GFL", "GFM"):
-        assert f"{mode}: no plan passed, so there is none whose rating could be sought." in text
+        assert f"{mode}: the frontier was not searched, so no prices of margins are known." in text
 
 
 def test_parameters_that_the_study_sets_are_shown_with_its_values(source: str) -> None:

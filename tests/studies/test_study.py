@@ -115,7 +115,7 @@ def test_a_folder_made_with_other_versions_is_refused(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str, told: str
 ) -> None:
-    monkeypatch.setattr(Study, "_setting", lambda *_: pytest.fail("work was done"))
+    monkeypatch.setattr(Study, "setting", lambda *_: pytest.fail("work was done"))
     (tmp_path / "taken").write_text("mine")
     with pytest.raises(InputError) as caught:
         Study.load(small(tmp_path)).run(tmp_path / out)

@@ -49,10 +49,10 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
         framework,
         internal_response,
         network_map,
+        sensitivity,
         supervisor,
         system_limit,
         validation,
-        what_if,
         worst,
     )
 
@@ -83,7 +83,7 @@ def _figures(findings: Findings) -> Iterator[tuple[str, Figure]]:
     tradeoff = system_limit.draw(findings)
     if tradeoff is not None:
         yield "system_limit", tradeoff
-    tornado = what_if.draw(findings)
+    tornado = sensitivity.draw(findings)
     if tornado is not None:
-        yield "what_if", tornado
+        yield "sensitivity", tornado
     yield "supervisor", supervisor.draw(findings.facility(findings.modes[0]))

@@ -21,8 +21,8 @@ from dcvrt.studies.report import (
     models,
     plans,
     record,
+    sensitivity,
     system_limit,
-    what_if,
 )
 from dcvrt.studies.report.page import Safe, escape
 
@@ -43,7 +43,7 @@ SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
     models.facility,
     record.simulations,
     models.assumptions,
-    what_if.what_if,
+    sensitivity.sensitivity,
     models.deviations,
     record.method,
     record.provenance,

@@ -8,7 +8,7 @@ from dcvrt.dae import Row as ParameterRow
 from dcvrt.studies.figures.internal_response import on_test_waveform
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.page import Safe, definitions, escape, figure, paragraph, section, table
-from dcvrt.studies.report.what_if import reference
+from dcvrt.studies.report.sensitivity import reference
 from dcvrt.studies.style import mode_name
 
 
