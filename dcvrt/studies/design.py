@@ -342,10 +342,10 @@ def _trial(trial: Trial | None, exposures: Sequence[Exposure]) -> dict[str, Any]
 
 
 FOOTER = """\
-Margins by the replay: voltage in pu, loss as a share of the import. Each parameter
-alone, the others as in the study. Where events change or a margin jumps, gradients
-say nothing; the value is the side that was run and passed. Open loop: a facility
-does not act back on the grid in a fault."""
+Margins by the replay: voltage in pu, loss as a share of the import. Each
+parameter alone, the others as in the study. Where events change or a margin
+jumps, gradients say nothing; the value is the side that was run and passed.
+Open loop: a facility does not act back on the grid in a fault."""
 
 
 def header(setting: Setting, ask: Ask) -> str:

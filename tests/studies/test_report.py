@@ -263,7 +263,7 @@ def test_every_assumption_stands_with_gradient_and_search(page: Page) -> None:
         "peak: the <link> collapsed"
     ) in page.text
     assert "dc_loop.K_p: proportional gain over H 1 0.8 / 1.2 -3 +0.6 / – – / – high: no <gap>" in page.text
-    assert "GFM: 1 assumptions that move nothing at first order" in page.text
+    assert "GFM: 1 assumption(s) that move nothing at first order" in page.text
     assert "Gradients and search agree to a tenth at 1 of 2 ends searched again." in page.text
     assert (
         "loss at bus 108, fault bus 111, 100 ms, peak (1200 MW per share, +7.0 MW per 0.01 of β)" in page.text
@@ -276,7 +276,7 @@ def test_a_plan_that_the_network_holds_has_no_zeros_for_findings(page: Page) -> 
         "is held by no margin, so there is no MW per unit: it is left out, not zero. What holds it: "
         "line 80-99. No margin is near."
     ) in page.text
-    assert "GFL: 4 assumptions" in page.text
+    assert "GFL: 4 assumption(s)" in page.text
 
 
 def test_parameters_that_differ_by_mode_lead_to_their_effect(page: Page) -> None:

@@ -73,7 +73,7 @@ def sensitivity(findings: Findings) -> Safe:
         if still:
             parts.append(
                 Safe(
-                    f"<details><summary>{escape(mode_name(mode))}: {len(still)} assumptions that move "
+                    f"<details><summary>{escape(mode_name(mode))}: {len(still)} assumption(s) that move "
                     "nothing at first order, and with which the plan passes at both ends</summary>"
                     f"{bullets([_still(row) for row in still])}</details>"
                 )
