@@ -261,6 +261,7 @@ def of_plan(request: Mapping[str, Any]) -> dict[str, Any]:
         values of the study finds; `grid`, `facility`: simulations made.
     """
     setting = setting_of(StudyFile.model_validate(request["study"]), Path(request["folder"]))
+    _ = setting.no_vrt  # its cuts are what later solves, which look at few hours, start from
     mode, plan, reruns = request["mode"], request["plan"], Reruns(setting)
     file = setting.file
     parameters = replay.simulator_of(mode, parameters_of(file, mode)).dae.parameters

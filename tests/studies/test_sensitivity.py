@@ -226,6 +226,18 @@ def test_a_mode_without_an_answer_is_told_and_asked_again(
         assert records(store.sensitivities()) == []
 
 
+def test_in_closed_loop_there_are_none(study: Study, result: Result, tmp_path: Path) -> None:
+    """There the voltages depend on what would be varied."""
+    copy = tmp_path / "study.sqlite"
+    copy.write_bytes((result.folder / "study.sqlite").read_bytes())
+    grid = study.file.grid.model_copy(update={"coupling": "closed"})
+    setting = study.setting(study.file.model_copy(update={"grid": grid}))
+    with Store(copy, write=True) as store:
+        assert run_sensitivity(Campaign(store, InProcess()), setting, Silent()) == []
+        assert records(store.sensitivities()) == []
+        assert store.provenance()["sensitivity_plans"] == {}
+
+
 # -- which plan ----------------------------------------------------------------------------------------------
 
 

@@ -138,8 +138,8 @@ def reference(findings: Findings, differing: list[str]) -> Safe:
 def _missing(findings: Findings, mode: str) -> str:
     if findings.study.grid.coupling == "closed":
         return (
-            f"{mode_name(mode)}: the study searches in closed loop, where the voltages depend on what would be "
-            "varied; sensitivities are found in open loop only."
+            f"{mode_name(mode)}: the study searches in closed loop, where the voltages depend on what would "
+            "be varied; sensitivities are found in open loop only."
         )
     if "frontier" not in findings.methods:
         return f"{mode_name(mode)}: the frontier was not searched, so no prices of margins are known."
