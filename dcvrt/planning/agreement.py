@@ -57,11 +57,13 @@ class Agreement:
         Whether the screen is moved at all; else one look tells how wrong it is.
     thorough : bool
         Whether every hour that may be near a limit is solved; else only the hours in which the screen has
-        each bus nearest: what it then agrees to is to be confirmed by `allows`.
+        each bus nearest: what it then agrees to is to be confirmed by `allows`. A screen
+            that has never agreed in every hour is always looked at thoroughly.
     """
 
     def __init__(self, screen: VoltageScreen, repeat: bool = True, thorough: bool = True) -> None:
-        self.screen, self.repeat, self.thorough = screen, repeat, thorough
+        self.screen, self.repeat = screen, repeat
+        self.thorough = thorough or not screen.settled
         self.passes, self.checked = 0, 0
         self.guard = GUARD
         self.error, self.lowest, self.highest = 0.0, np.nan, np.nan
@@ -115,6 +117,7 @@ class Agreement:
             return True
         apart = self._differs(solution.H, look, tangents)
         if apart <= AGREED_AT_LIMITS and self.error <= AGREED_EVERYWHERE:
+            self.screen.settled |= self.thorough
             return True
         return self._move(solution.H, look, master)
 
@@ -200,13 +203,16 @@ class Agreement:
         limit: enough to see most limits that the screen lets be broken."""
         screen = self.screen
         rows = screen.near(H, 0.0)
-        room = screen.room(screen.voltages(H, rows), rows)
+        linear = screen.voltages(H, rows)
+        room = screen.room(linear, rows)
         self.least_room = np.minimum(room.min(axis=0, initial=MARGIN), MARGIN)
         worst = room.argmin(axis=1)
         hours = np.unique(np.r_[worst, [t.hour for t in _tight(tangents, H)]].astype(np.int64))
         if not len(hours):
             hours = np.array([tangents[0].hour])
-        return _Look(rows, hours, screen.ac.solve(H, hours).require(), None)
+        solved = screen.ac.solve(H, hours).require()
+        self.error = _error(screen, rows, hours, screen.sizes(solved)[rows], linear[:, hours])
+        return _Look(rows, hours, solved, None)
 
     def _look(self, H: Floats, tangents: list[Tangent]) -> _Look:
         """Solve the hours that matter at `H`, and say what to expect in the others."""

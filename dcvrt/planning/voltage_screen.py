@@ -171,6 +171,8 @@ class VoltageScreen:
         self.interpolation = VoltageDrop(ac.year)
         self.slope = ac.slopes(ac.unhosted, np.arange(len(self.year)))
         self.constant = size.copy()
+        self.settled = False
+        """Whether AC power flow has agreed in every hour once: from then on its hours are well placed."""
         self.lower = np.minimum(limits[0], size)
         self.upper = np.maximum(limits[1], size)
         # Extremes over the hours, from which `near` bounds voltages for H >= 0.

@@ -111,6 +111,15 @@ def test_a_quick_solve_that_is_confirmed_is_the_thorough_one() -> None:
         assert plan.total_mw == pytest.approx(thorough.solve(bounds=box).total_mw, abs=1e-2)
 
 
+def test_a_quick_solve_may_be_the_first() -> None:
+    problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    plan = problem.solve(thorough=False)
+    assert problem.allows(plan.by_site)
+    assert plan.total_mw == pytest.approx(
+        HostingProblem(NETWORK, SITES, WEEK, 0.6).solve().total_mw, abs=1e-2
+    )
+
+
 def test_what_the_network_cannot_host_is_not_allowed() -> None:
     problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
     plan = problem.solve()
