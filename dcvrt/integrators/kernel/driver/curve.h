@@ -37,7 +37,7 @@ struct scratch {
 };
 
 #define NEWTON_STEPS 12
-#define POLISHED 1e-13 /* s; times are polished until they move by less */
+#define POLISHED 1e-9 /* s; a time that moved by less in a step of Newton's method is exact after it */
 
 /* a / b with its derivative da, given those of a and b. */
 static double quotient_slope(double quotient, double da, double b, double db)
@@ -254,11 +254,11 @@ static double doubt(const struct curve *c, long k)
 /* Move an extremum of a cubic to that of the solution: root of the rate by secants. */
 static void sharpen(struct curve *c, long i)
 {
+    if (c->between[i] != OF_CUBIC)
+        return;
     double t = c->t[i], y = c->y[i], rate, before = 0;
     /* first the curvature of the cubic, from the piece on the right */
     double h = c->t[i + 1] - t, slope = (6 * (c->y[i + 1] - y) / h - 2 * c->rate[i + 1]) / h;
-    if (c->between[i] != OF_CUBIC)
-        return;
     for (int k = 0; k < NEWTON_STEPS; k++) {
         exactly(c, c->node[i], t, &y, &rate, 0, 0);
         if (k && rate != before)
@@ -269,9 +269,11 @@ static void sharpen(struct curve *c, long i)
             exactly(c, c->node[i], t, &y, &rate, 0, 0);
             break;
         }
-        if (fabs(step) <= POLISHED)
-            break;
         t -= step;
+        if (fabs(step) <= POLISHED) { /* the value of the parabola: it moves by less than its round-off */
+            y -= 0.5 * rate * step;
+            break;
+        }
         h = -step;
         before = rate;
     }

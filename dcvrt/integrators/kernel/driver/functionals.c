@@ -21,8 +21,8 @@ static void at_knot(struct curve *c, long i, struct outcome *out)
     sharpen(c, i);
     out->time = c->t[i];
     out->place = c->between[i] ? PLACE_INSIDE : track->kind[k];
-    if (!c->between[i] && !track->nw) {
-        out->value = c->y[i]; /* values at nodes are exact as they are */
+    if (!track->nw) {
+        out->value = c->y[i];
         return;
     }
     exactly(c, k, out->time, &out->value, &rate, out->gradient, 0);
@@ -171,6 +171,8 @@ static double passes(struct curve *c, long i, const struct level *level, struct 
         return c->t[i];
     }
     double y, rate, t = polish_level(c, i, level->value, meets(c, i, level->value));
+    if (!track->nw)
+        return t;
     exactly(c, k, t, &y, &rate, s->a, 0);
     for (int w = 0; w < track->nw; w++) /* a level that is only touched has no derivative */
         moved[w] = rate != 0 ? -(s->a[w] - level->share * level->first[w]) / rate : NAN;
@@ -263,12 +265,21 @@ static int looks_for_high(int kind)
     return kind == FUNCTIONAL_MAXIMUM || kind == FUNCTIONAL_SUSTAINED_MAXIMUM || kind == FUNCTIONAL_TIME_ABOVE;
 }
 
-static void compute(struct curve *c, const struct functional *what, struct scratch *s, struct outcome *out)
+/* Value at the first node and its derivative. */
+static void first_value(struct curve *c, double *value, double *theta)
 {
     double rate;
+    if (c->track->nw)
+        exactly(c, 0, c->track->t[0], value, &rate, theta, 0);
+    else
+        at_node(c, 0, value, &rate);
+}
+
+static void compute(struct curve *c, const struct functional *what, struct scratch *s, struct outcome *out)
+{
     struct level level = {c->sign * what->constant, 0.0, s->first};
     if (what->relative) {
-        exactly(c, 0, c->track->t[0], &level.value, &rate, s->first, 0);
+        first_value(c, &level.value, s->first);
         level.share = what->constant;
         level.value *= level.share;
     } else {
@@ -277,7 +288,7 @@ static void compute(struct curve *c, const struct functional *what, struct scrat
     }
     switch (what->kind) {
     case FUNCTIONAL_INITIAL:
-        exactly(c, 0, c->track->t[0], &out->value, &rate, out->gradient, 0);
+        first_value(c, &out->value, out->gradient);
         break;
     case FUNCTIONAL_MINIMUM:
     case FUNCTIONAL_MAXIMUM:
@@ -296,7 +307,10 @@ static void compute(struct curve *c, const struct functional *what, struct scrat
         break;
     case FUNCTIONAL_INTEGRAL:
     case FUNCTIONAL_POSITIVE_INTEGRAL:
-        integral(c, what->kind == FUNCTIONAL_POSITIVE_INTEGRAL, s, out);
+        if (c->track->nw)
+            integral(c, what->kind == FUNCTIONAL_POSITIVE_INTEGRAL, s, out);
+        else
+            out->value = integral_of_cubics(c, what->kind == FUNCTIONAL_POSITIVE_INTEGRAL);
         break;
     case FUNCTIONAL_RECOVERY_TIME:
         time_below(c, &level, 1, s, out);
@@ -316,7 +330,7 @@ int functionals_of(const struct track *track, const struct functional *what, int
     struct track still = *track; /* the same without derivatives */
     still.nw = 0;
     struct scratch scratch;
-    int finite = 0, nw = track->nw;
+    int known = 0, finite = 0, nw = track->nw;
     if (!workspace_ready(workspace, track, &curve, &scratch))
         return FUNCTIONALS_NO_MEMORY;
     for (int k = 0; k < count; k++) {
@@ -325,14 +339,19 @@ int functionals_of(const struct track *track, const struct functional *what, int
             curve.signal = what[k].signal;
             curve.per = what[k].per;
             curve.sign = sign;
+            known = 0;
+        }
+        int first_only = what[k].kind == FUNCTIONAL_INITIAL;
+        if (!first_only && !known) {
             finite = make_knots(&curve);
+            known = 1;
         }
         struct outcome out = {NAN, NAN, results->gradient + k * nw, PLACE_NONE, 0};
-        int gradient = finite && !what[k].value_only;
+        int usable = first_only || finite, gradient = usable && !what[k].value_only;
         for (int w = 0; w < nw; w++)
             out.gradient[w] = gradient ? 0.0 : NAN;
         curve.track = gradient ? track : &still;
-        if (finite)
+        if (usable)
             compute(&curve, &what[k], &scratch, &out);
         for (int w = 0; w < nw && isnan(out.value); w++)
             out.gradient[w] = NAN;

@@ -1,4 +1,5 @@
-/* Integral of a curve, or of its positive part, with its derivatives by theta as further columns of one row.
+/* Integral of a curve, or of its positive part. Without derivatives it is that of the cubics, which were seen to
+ * meet the solution in their middles; with derivatives by theta they are further columns of one row.
  *
  * Over an interval it is that of the cubics, which the values and rates at its ends give, and what the change
  * of their third derivative from the interval before tells of the next term. Where that is large, the interval
@@ -10,9 +11,9 @@
 
 #include "curve.h"
 
-/* Largest correction of an integral, over its span and the size of its integrand: what is left is well below.
- * A value without its gradient is a diagnostic. */
-#define INTEGRATED(m) ((m) > 1 ? 1e-6 : 1e-5)
+/* Largest correction of an integral, over its span and the size of its integrand: what is left is well below. */
+#define INTEGRATED 1e-6
+#define SMALL_ERROR 1e-5 /* likewise without derivatives; a larger one tells nothing and is left out */
 #define FINEST 64
 #define NOISE 1e-7 /* of the largest value: what changes its sign below it is taken for zero */
 
@@ -50,7 +51,7 @@ static void add_finely(struct curve *c, long k, double low, double high, struct 
         agree = 1;
         for (int w = 0; w < m; w++) {
             double error = (s->finer[w] - s->sum[w]) / 15;
-            agree &= fabs(error) <= INTEGRATED(m) * (high - low) * s->size[w];
+            agree &= fabs(error) <= INTEGRATED * (high - low) * s->size[w];
             s->sum[w] = s->finer[w] + error;
         }
         if (!agree)
@@ -62,8 +63,7 @@ static void add_finely(struct curve *c, long k, double low, double high, struct 
 }
 
 /* Add the integral over the interval between the rows, with the fourth derivative that the change of the
- * third one tells (0 without an interval before). Where that is too large it tells nothing: a value alone is then
- * that of the cubics, which were seen to meet the solution in the middle; with a gradient 0 is returned, and
+ * third one tells (0 without an interval before). Where that is too large it tells nothing: 0 is returned, and
  * nothing added. */
 static int add_interval(double h, double h_before, int m, struct scratch *s, double *total)
 {
@@ -73,26 +73,16 @@ static int add_interval(double h, double h_before, int m, struct scratch *s, dou
         double third = 6 / (h * h) * (s->left_rate[w] + s->right_rate[w] - 2 * rise / h);
         double fourth = h_before > 0 ? 2 * (third - s->third[w]) / (h + h_before) : third / h;
         double error = fourth * h * h * h * h / 720;
-        small &= fabs(error) <= INTEGRATED(m) * s->size[w];
+        small &= fabs(error) <= INTEGRATED * s->size[w];
         s->third[w] = third;
         s->sum[w] = h_before > 0 ? error * h : 0.0;
     }
-    if (!small && m > 1)
-        return 0;
     if (!small)
-        s->sum[0] = 0;
+        return 0;
     add_cubics(h, m, s->left, s->left_rate, s->right, s->right_rate, s->sum);
     for (int w = 0; w < m; w++)
         total[w] += s->sum[w];
     return 1;
-}
-
-static void row_at_node(struct curve *c, long k, double *value, double *rate)
-{
-    if (c->track->nw)
-        signal_row(c, k, c->track->t[k], value, rate);
-    else
-        at_node(c, k, value, rate);
 }
 
 /* Integral over the parts of one interval between nodes on which the signal is positive; `first` to `last`
@@ -114,6 +104,48 @@ static void add_positive_parts(struct curve *c, long first, long last, struct sc
         signal_row(c, k, high, s->right, s->right_rate);
         add_finely(c, k, low, high, s, total);
     }
+}
+
+/* Integral over one piece of a cubic, or over the part on which it is positive. */
+static double integral_of_piece(const struct curve *c, long i, int positive)
+{
+    double low = c->t[i], high = c->t[i + 1], sum = 0;
+    double y0 = c->y[i], y1 = c->y[i + 1], rate0 = c->rate[i], rate1 = c->rate[i + 1];
+    if (positive && y0 <= 0 && y1 <= 0)
+        return 0;
+    if (positive && y0 < 0)
+        low = meets(c, i, 0.0), y0 = on_piece(c, i, low, &rate0);
+    else if (positive && y1 < 0)
+        high = meets(c, i, 0.0), y1 = on_piece(c, i, high, &rate1);
+    add_cubics(high - low, 1, &y0, &rate0, &y1, &rate1, &sum);
+    return sum;
+}
+
+/* Integral without derivatives: of the cubics, with the fourth derivative that the change of the third one tells. */
+static double integral_of_cubics(const struct curve *c, int positive)
+{
+    double total = 0, size = 0, third_before = 0, h_before = 0;
+    for (long i = 0, next; i + 1 < c->n; i = next) {
+        int whole = 1;
+        for (next = i + 1; c->between[next]; next++)
+            whole &= c->y[next] >= 0;
+        double h = c->t[next] - c->t[i], y0 = c->y[i], y1 = c->y[next];
+        if (h > 0 && (!positive || (whole && y0 >= 0 && y1 >= 0))) {
+            double third = 6 / (h * h) * (c->rate[i] + c->rate[next] - 2 * (y1 - y0) / h);
+            double error = h_before > 0 ? 2 * (third - third_before) / (h + h_before) * h * h * h * h / 720 : 0;
+            size = higher(size, fabs(y1));
+            add_cubics(h, 1, &y0, c->rate + i, &y1, c->rate + next, &total);
+            if (fabs(error) <= SMALL_ERROR * size)
+                total += error * h;
+            third_before = third;
+            h_before = h;
+        } else {
+            for (long piece = i; piece < next && h > 0; piece++)
+                total += integral_of_piece(c, piece, positive);
+            h_before = 0;
+        }
+    }
+    return total;
 }
 
 static void integral(struct curve *c, int positive, struct scratch *s, struct outcome *out)
@@ -152,13 +184,13 @@ static void integral(struct curve *c, int positive, struct scratch *s, struct ou
             continue;
         }
         if (loaded != k) {
-            row_at_node(c, k, s->left, s->left_rate);
+            signal_row(c, k, track->t[k], s->left, s->left_rate);
             h_before = 0;
         }
-        row_at_node(c, k + 1, s->right, s->right_rate);
+        signal_row(c, k + 1, track->t[k + 1], s->right, s->right_rate);
         for (int w = 0; w < m; w++) /* what is small beside the signal itself need not be small in itself */
             s->size[w] = higher(higher(s->size[w], fabs(s->right[w])), 1e-4 * s->size[0]);
-        if (!add_interval(h, h_before, m, s, total) && m > 1)
+        if (!add_interval(h, h_before, m, s, total))
             add_finely(c, k, track->t[k], track->t[k + 1], s, total);
         h_before = h;
         loaded = k + 1;
