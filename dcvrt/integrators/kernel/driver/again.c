@@ -54,10 +54,12 @@ static long section_of(const struct inputs *in, long piece)
 static void make_step(struct again *a, double h, struct dense *dense)
 {
     struct fleet *f = a->fleet;
+    struct course *c = &a->lane;
     double rate[N];
+    course_flow(c, c->t, c->x, c->z, rate);
     lay_state(f, 0, rate);
     AT(f->h, 0) = f->step[0] = h;
-    f->spans[0] = leaves_piece(f, 0, a->lane.t + h);
+    f->spans[0] = leaves_piece(f, 0, c->t + h);
     method_step(f);
     method_dense(f, 0, dense);
 }

@@ -86,6 +86,29 @@ static void spot_rate(struct spot *s, int with_theta)
     flow(&s->at, s->d);
 }
 
+/* The present point with the rate of the states, which is computed once. */
+static void spot_rated(struct spot *s, struct course *c)
+{
+    spot_now(s, c);
+    if (c->rated) {
+        memcpy(s->d, c->rate, NX * sizeof(double));
+        return;
+    }
+    spot_rate(s, 0);
+    memcpy(c->rate, s->d, NX * sizeof(double));
+    c->rated = 1;
+}
+
+/* Watched outputs and their rates. */
+static void watched_at(struct spot *s, double *y, double *rate)
+{
+#if WATCHED > 0
+    watch(&s->at, y, rate);
+#else
+    (void)s, (void)y, (void)rate;
+#endif
+}
+
 static long last_piece(const struct course *c) { return c->task->inputs->section[c->section + 1] - 1; }
 
 static void spot_between(struct spot *s, struct course *c, double t, const double *x, const double *z)
@@ -105,17 +128,37 @@ void course_flow(struct course *c, double t, const double *x, const double *z, d
 }
 
 /* Guards that matter, signed so that they rise when it counts; the others are -1 at rate 0. */
-void course_guards(struct course *c, double t, const double *x, const double *z, double *h, double *rate)
+static void signed_guards(const struct course *c, const struct spot *s, double *h, double *rate)
 {
-    struct spot s;
     double g[AT_LEAST_ONE(GUARDS)], r[AT_LEAST_ONE(GUARDS)];
-    spot_between(&s, c, t, x, z);
-    spot_rate(&s, 0);
-    look(&s.at, g, r);
+    look(&s->at, g, r);
     for (int k = 0; k < GUARDS; k++) {
         h[k] = c->sign[k] != 0 ? c->sign[k] * g[k] : -1.0;
         rate[k] = c->sign[k] * r[k];
     }
+}
+
+static void course_guards(struct course *c, double t, const double *x, const double *z, double *h, double *rate)
+{
+    struct spot s;
+    spot_between(&s, c, t, x, z);
+    spot_rate(&s, 0);
+    signed_guards(c, &s, h, rate);
+}
+
+/* Rate of the states with its sensitivities, and guards, at the present point. */
+void course_here(struct course *c, double *f, double *h, double *rate)
+{
+    struct spot s;
+    if (NW) {
+        spot_now(&s, c);
+        spot_rate(&s, 1);
+        unpack_columns(s.ds, NX, f + NX);
+    } else {
+        spot_rated(&s, c);
+    }
+    memcpy(f, s.d, NX * sizeof(double));
+    signed_guards(c, &s, h, rate);
 }
 
 /* The cubic a + s (c1 + s (c2 + s c3)) through two values with slopes, s in [0, 1]. */
@@ -240,6 +283,7 @@ static int consistent(const struct inputs *in, long piece, double t, const doubl
 static int make_consistent(struct course *c)
 {
 #if NZ > 0
+    c->rated = 0;
     if (!consistent(c->task->inputs, c->piece, c->t, c->x, c->z, c->entry, c->m, c->mc)) {
         course_fail(c, NOT_CONSISTENT, c->t, c->t);
         return 0;
@@ -288,8 +332,7 @@ static int jump(struct course *c, int row, const int *ties, const double *dte)
     double moved[NX];
     if (c->jumps <= MAX_JUMPS_AT_ONCE) c->visited[c->jumps] = row;
     if (++c->jumps > MAX_JUMPS_AT_ONCE) return course_fail(c, CHATTER, c->t, c->t), 0;
-    spot_now(&s, c);
-    spot_rate(&s, 0);
+    spot_rated(&s, c);
     memcpy(moved, s.d, sizeof moved);
     if (row_resets[row]) {
         double after[NX];
@@ -308,10 +351,10 @@ static int jump(struct course *c, int row, const int *ties, const double *dte)
     for (int k = 0; k < ROWS; k++)
         if (row_automaton[k] == a) c->armed[k] = NAN;
     course_fixed(c->task->p, c->mode, c->dentry, c->m, c->mc);
+    c->rated = 0;
     if (!make_consistent(c)) return 0;
     if (NW) {
-        spot_now(&s, c);
-        spot_rate(&s, 0);
+        spot_rated(&s, c);
         for (int j = 0; j < NW; j++)
             for (int i = 0; i < NX; i++) c->x[NX + j * NX + i] += (moved[i] - s.d[i]) * dte[j];
         if (!make_consistent(c)) return 0;
@@ -325,8 +368,7 @@ static void positive_now(struct course *c, int forced, int value, int *positive)
     struct spot s;
     double g[AT_LEAST_ONE(GUARDS)], rate[AT_LEAST_ONE(GUARDS)];
     if (!ROWS) return;
-    spot_now(&s, c);
-    spot_rate(&s, 0);
+    spot_rated(&s, c);
     look(&s.at, g, rate);
     for (int k = 0; k < ROWS; k++)
         positive[k] = fabs(g[k]) <= fabs(rate[k]) * SAME_INSTANT ? rate[k] > 0 : g[k] > 0;
@@ -410,6 +452,7 @@ static int enter_section(struct course *c, long number)
     c->section = number;
     c->piece = in->section[number];
     c->border = in->start[in->section[number + 1]];
+    c->rated = 0;
     if (!number && !make_consistent(c)) return 0;
     if (!within_bounds(c)) return 0;
     if (number && !begin_phase(c, none, PLACE_JUMP)) return 0;
@@ -461,6 +504,7 @@ int course_begin(struct course *c, const struct task *task, const struct options
     c->task = task;
     c->options = options;
     c->t = in->start[0];
+    c->rated = 0;
     memcpy(c->x, task->x, N * sizeof(double));
     memcpy(c->z, task->z, NZN * sizeof(double));
     c->piece = c->section = 0;
@@ -492,6 +536,7 @@ int course_move(struct course *c, double t, const double *x, const double *z)
     const struct inputs *in = c->task->inputs;
     c->piece = piece_at(in, c->piece, in->section[c->section], last_piece(c), t);
     c->t = t;
+    c->rated = 0;
     memcpy(c->x, x, N * sizeof(double));
     memcpy(c->z, z, NZN * sizeof(double));
     return next_limit(c);
@@ -641,13 +686,13 @@ static void at_crossing(struct course *c, int row, double t)
     int rising = c->sign[row] > 0;
     c->piece = piece_at(in, c->piece, in->section[c->section], last_piece(c), t);
     c->t = t;
+    c->rated = 0;
     dense_at(&c->dense, t, c->x, c->z);
     if (!make_consistent(c)) return;
 #if NW > 0
     double g[GUARDS], rate[GUARDS], slopes[GUARDS * NW];
     column columns[GROUPS * GUARDS];
-    spot_now(&s, c);
-    spot_rate(&s, 0);
+    spot_rated(&s, c);
     look(&s.at, g, rate);
     cross(&s.at, columns);
     unpack_columns(columns, GUARDS, slopes);

@@ -110,6 +110,8 @@ struct course {
     const struct options *options;
     /* now */
     double t, x[N], z[AT_LEAST_ONE(NZN)];
+    double rate[NX]; /* of the states now, where `rated` */
+    int rated;
     long piece, section;
     double border, limit; /* end of the section; end of the next step at the latest */
     /* automata */
@@ -171,19 +173,17 @@ int course_cross(struct course *c, const double *h0, const double *r0, double t1
 enum seen course_inputs(struct course *c, double t1);
 int course_record(struct course *c, double t1, const double *x1, const double *z1);
 void course_fail(struct course *c, enum status status, double from, double to);
-void course_guards(struct course *c, double t, const double *x, const double *z, double *h, double *rate);
+void course_here(struct course *c, double *f, double *h, double *rate);
 void course_flow(struct course *c, double t, const double *x, const double *z, double *f);
 
 void course_fixed(const double *p, const int *mode, const double *dentry, double *m, double *mc);
 
 /* record.c */
-int record_step(struct course *c, double t, double h, const double *x, const double *z);
+double *record_step(struct course *c, double h);
 void record_free(struct record *r);
 
 /* nodes.c */
-int nodes_to(struct course *c, double t1, const double *y0, const double *r0, const double *y1, const double *r1,
-             int refine);
-void nodes_at(struct course *c, double t, const double *x, const double *z, double *y, double *rate);
+int nodes_to(struct course *c, double t1, const double *y1, const double *r1, int refine);
 
 /* again.c */
 struct again *again_new(const struct options *options);

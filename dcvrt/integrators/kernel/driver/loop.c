@@ -280,7 +280,7 @@ static double first_step(struct course *c, const double *rate, double most)
     d1 = sqrt(d1 / NX);
     d2 = sqrt(d2 / NX) / h;
     double fastest = fmax(d1, d2);
-    double next = fastest <= 1e-15 ? fmax(1e-6, h * 1e-3) : pow(0.01 / fastest, CONTROL_REJECTED);
+    double next = fastest <= 1e-15 ? fmax(1e-6, h * 1e-3) : rough_exp2(CONTROL_REJECTED * rough_log2(0.01 / fastest));
     next = fmin(fmin(100 * h, next), most);
     return next > 0 ? next : 1e-9; /* not finite: the first step will tell */
 }
@@ -294,8 +294,8 @@ static void lay_fixed(struct fleet *f, int lane, const double *m, const double *
     for (int a = 0; a < NA; a++) AT(f->entry[a], lane) = entry[a];
 }
 
-/* Lay the state of a course on a lane; its rate there. */
-static void lay_state(struct fleet *f, int lane, double *rate)
+/* Lay the state of a course on a lane, and its rate. */
+static void lay_state(struct fleet *f, int lane, const double *rate)
 {
     struct course *c = f->course[lane];
     const struct inputs *in = c->task->inputs;
@@ -306,7 +306,6 @@ static void lay_state(struct fleet *f, int lane, double *rate)
     f->first_piece[lane] = in->section[c->section];
     f->last_piece[lane] = in->section[c->section + 1] - 1;
     load_piece(f, lane, c->piece);
-    course_flow(c, c->t, c->x, c->z, rate);
     method_restart(f, lane, rate);
 }
 
@@ -315,8 +314,8 @@ static void load_lane(struct fleet *f, int lane)
 {
     struct course *c = f->course[lane];
     double rate[N], h[AT_LEAST_ONE(GUARDS)], r[AT_LEAST_ONE(GUARDS)];
+    course_here(c, rate, h, r);
     lay_state(f, lane, rate);
-    course_guards(c, c->t, c->x, c->z, h, r);
     for (int k = 0; k < GUARDS; k++) {
         AT(f->sign[k], lane) = c->sign[k];
         AT(f->guard[k], lane) = h[k];
@@ -345,7 +344,7 @@ static int leaves_piece(struct fleet *f, int lane, double t1)
 static void plan_step(struct fleet *f, int lane)
 {
     struct course *c = f->course[lane];
-    double left = c->limit - c->t, h = fmin(f->wanted[lane], c->options->longest);
+    double left = c->limit - c->t, h = lower(f->wanted[lane], c->options->longest);
     f->last[lane] = h >= left * (1 - 1e-6);
     if (f->last[lane]) h = left;
     else if (2 * h > left) h = 0.5 * left;
@@ -364,19 +363,19 @@ static int judge_step(struct fleet *f, int lane, double error)
     f->seen[lane] = error <= 1.0 && f->spans[lane] ? course_inputs(c, t1) : INPUTS_ONE_CUBIC;
     if (f->seen[lane] == INPUTS_UNSEEN) error = 16.0;
     if (error <= 1.0) {
-        double now = rough_log2(fmax(error, 1e-10)), factor;
+        double now = rough_log2(higher(error, 1e-10)), factor;
         factor = 0.9 * rough_exp2(CONTROL_BEFORE * f->trend[lane] - CONTROL_NOW * now);
-        factor = fmin(6.0, fmax(0.2, factor));
-        f->trend[lane] = fmax(now, -13.0);
+        factor = lower(6.0, higher(0.2, factor));
+        f->trend[lane] = higher(now, -13.0);
         /* a step that was cut by a limit says little about the size that is possible */
-        f->wanted[lane] = f->last[lane] || h < f->wanted[lane] ? fmax(h * factor, f->wanted[lane]) : h * factor;
+        f->wanted[lane] = f->last[lane] || h < f->wanted[lane] ? higher(h * factor, f->wanted[lane]) : h * factor;
         c->accepted++;
         if (c->accepted + c->rejected > o->max_steps) return course_fail(c, TOO_MANY_STEPS, c->t, t1), 0;
         return 1;
     }
     c->rejected++;
     int finite = isfinite(error);
-    f->wanted[lane] = h * (finite ? fmax(0.2, 0.9 * rough_exp2(-CONTROL_REJECTED * rough_log2(error))) : 0.25);
+    f->wanted[lane] = h * (finite ? higher(0.2, 0.9 * rough_exp2(-CONTROL_REJECTED * rough_log2(error))) : 0.25);
     if (f->wanted[lane] < 4e-16 * fmax(1.0, fabs(c->t)))
         course_fail(c, finite ? STEP_TOO_SMALL : NOT_FINITE, c->t, t1);
     else if (c->accepted + c->rejected > o->max_steps)
@@ -415,9 +414,10 @@ static int after_step(struct fleet *f, int lane, int crossing, int missed)
     int look_closer = crossing || (c->watches_input && varied);
     int refine = missed || (WATCH_READS_INPUT && varied);
     if (o->steps) {
-        from_lane(x1, NX, f->x, f->xs, lane);
-        from_lane(z1, NZ, f->z, f->zs, lane);
-        if (!record_step(c, c->t, f->step[lane], x1, z1)) return 0;
+        double *begin = record_step(c, f->step[lane]);
+        if (!begin) return 0;
+        from_lane(begin, NX, f->x, f->xs, lane);
+        from_lane(begin + N, NZ, f->z, f->zs, lane);
     }
     int samples_inside = o->samples && f->step[lane] > o->save_at;
     if (look_closer || refine || samples_inside) method_dense(f, lane, &c->dense);
@@ -430,12 +430,9 @@ static int after_step(struct fleet *f, int lane, int crossing, int missed)
         if (course_cross(c, h0, r0, t1, h1, r1)) return 0;
     }
     if (o->nodes) {
-        double y0[AT_LEAST_ONE(WATCHED)], r0[AT_LEAST_ONE(WATCHED)], y1[AT_LEAST_ONE(WATCHED)], r1[AT_LEAST_ONE(WATCHED)];
-        for (int k = 0; k < WATCHED; k++) {
-            y0[k] = AT(f->watched[k], lane), r0[k] = AT(f->watched_rate[k], lane);
-            y1[k] = AT(f->watched1[k], lane), r1[k] = AT(f->watched_rate1[k], lane);
-        }
-        if (!nodes_to(c, t1, y0, r0, y1, r1, refine)) return 0;
+        double y1[AT_LEAST_ONE(WATCHED)], r1[AT_LEAST_ONE(WATCHED)];
+        for (int k = 0; k < WATCHED; k++) y1[k] = AT(f->watched1[k], lane), r1[k] = AT(f->watched_rate1[k], lane);
+        if (!nodes_to(c, t1, y1, r1, refine)) return 0;
         for (int k = 0; k < WATCHED; k++) AT(f->largest[k], lane) = c->largest[k];
     }
     if (f->last[lane] || o->samples) {

@@ -2,24 +2,15 @@
 
 enum { MOST_HALVINGS = 8 };
 
-/* Watched outputs and their rates at a point of the present phase. */
-void nodes_at(struct course *c, double t, const double *x, const double *z, double *y, double *rate)
-{
-#if WATCHED > 0
-    struct spot s;
-    spot_between(&s, c, t, x, z);
-    spot_rate(&s, 0);
-    watch(&s.at, y, rate);
-#else
-    (void)c, (void)t, (void)x, (void)z, (void)y, (void)rate;
-#endif
-}
-
+/* Watched outputs and their rates at a time of the step in `dense`. */
 static void nodes_on_step(struct course *c, double t, double *y, double *rate)
 {
+    struct spot s;
     double x[N], z[AT_LEAST_ONE(NZN)];
     dense_at(&c->dense, t, x, z);
-    nodes_at(c, t, x, z, y, rate);
+    spot_between(&s, c, t, x, z);
+    spot_rate(&s, 0);
+    watched_at(&s, y, rate);
 }
 
 /* Add nodes strictly between two points of a step, until the cubics between them meet the middles. */
@@ -42,15 +33,15 @@ static int halve(struct course *c, double ta, const double *ya, const double *ra
 
 /* Nodes inside the part of a step from the present time to t1: at knots of the inputs, if a watched output reads
  * them, and where the cubics ask for them. */
-static int nodes_inside(struct course *c, double t1, const double *y0, const double *r0, const double *y1,
-                        const double *r1)
+static int nodes_inside(struct course *c, double t1, const double *y1, const double *r1)
 {
     const struct inputs *in = c->task->inputs;
+    const struct record *record = &c->record;
     double t = c->t, y[AT_LEAST_ONE(WATCHED)], r[AT_LEAST_ONE(WATCHED)], ya[AT_LEAST_ONE(WATCHED)],
            ra[AT_LEAST_ONE(WATCHED)];
     long last = last_piece(c);
-    memcpy(ya, y0, WATCHED * sizeof(double));
-    memcpy(ra, r0, WATCHED * sizeof(double));
+    memcpy(ya, record->node_y + (record->nodes - 1) * WATCHED, WATCHED * sizeof(double));
+    memcpy(ra, record->node_rate + (record->nodes - 1) * WATCHED, WATCHED * sizeof(double));
     for (long knot = c->piece + 1; WATCH_READS_INPUT && knot <= last && in->start[knot] < t1; knot++) {
         if (in->start[knot] <= t) continue;
         nodes_on_step(c, in->start[knot], y, r);
@@ -72,11 +63,10 @@ static void own_begin(struct course *c)
 }
 
 /* Nodes of a step from the present time to t1 that ended without a crossing. */
-int nodes_to(struct course *c, double t1, const double *y0, const double *r0, const double *y1, const double *r1,
-             int refine)
+int nodes_to(struct course *c, double t1, const double *y1, const double *r1, int refine)
 {
     own_begin(c);
-    if (refine && !nodes_inside(c, t1, y0, r0, y1, r1)) return 0;
+    if (refine && !nodes_inside(c, t1, y1, r1)) return 0;
     return add_node(c, t1, y1, r1, c->record.steps - 1);
 }
 
@@ -84,11 +74,8 @@ int nodes_to(struct course *c, double t1, const double *y0, const double *r0, co
 static int nodes_before(struct course *c, double t)
 {
     if (!c->options->nodes) return 1;
-    const struct record *r = &c->record;
-    double y0[AT_LEAST_ONE(WATCHED)], r0[AT_LEAST_ONE(WATCHED)], y1[AT_LEAST_ONE(WATCHED)], r1[AT_LEAST_ONE(WATCHED)];
+    double y1[AT_LEAST_ONE(WATCHED)], r1[AT_LEAST_ONE(WATCHED)];
     own_begin(c);
-    memcpy(y0, r->node_y + (r->nodes - 1) * WATCHED, sizeof(double) * WATCHED);
-    memcpy(r0, r->node_rate + (r->nodes - 1) * WATCHED, sizeof(double) * WATCHED);
     nodes_on_step(c, t, y1, r1);
-    return nodes_inside(c, t, y0, r0, y1, r1);
+    return nodes_inside(c, t, y1, r1);
 }

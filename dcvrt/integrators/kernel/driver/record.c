@@ -143,7 +143,9 @@ static int emit_now(struct course *c)
         long begin = r->phase[r->phases - 1].first_node;
         if (r->nodes == begin || r->node_t[r->nodes - 1] != c->t) {
             double y[AT_LEAST_ONE(WATCHED)], rate[AT_LEAST_ONE(WATCHED)];
-            nodes_at(c, c->t, c->x, c->z, y, rate);
+            struct spot s;
+            spot_rated(&s, c);
+            watched_at(&s, y, rate);
             if (!add_node(c, c->t, y, rate, r->steps)) return 0;
         }
     }
@@ -170,20 +172,18 @@ int record_samples(struct course *c, const struct dense *d, double until)
     return 1;
 }
 
-/* Remember the begin of a step, so that its dense output can be had again. */
-int record_step(struct course *c, double t, double h, const double *x, const double *z)
+/* Remember a step from the present time on, so that its dense output can be had again. Returns where its first
+ * states and algebraic variables are to be written; null when there is no memory. */
+double *record_step(struct course *c, double h)
 {
     struct record *r = &c->record;
-    if (!c->options->steps) return 1;
-    if (!grow_steps(r)) return out_of_memory(c);
+    if (!grow_steps(r)) return out_of_memory(c), (double *)0;
     long k = r->steps++;
-    r->step_t[k] = t;
+    r->step_t[k] = c->t;
     r->step_h[k] = h;
-    memcpy(r->step_x + k * ALL, x, N * sizeof(double));
-    memcpy(r->step_x + k * ALL + N, z, NZN * sizeof(double));
     r->step_piece[k] = c->piece;
     r->step_phase[k] = r->phases - 1;
-    return 1;
+    return r->step_x + k * ALL;
 }
 
 /* Take a time that differs from the present by round-off for the present. */
@@ -195,6 +195,7 @@ static void be_at(struct course *c, double t)
     if (r->nodes && r->node_t[r->nodes - 1] == c->t) r->node_t[r->nodes - 1] = t;
     if (last->t == c->t) last->t = t;
     c->t = t;
+    c->rated = 0;
 }
 
 static int open_phase(struct course *c)
