@@ -92,9 +92,10 @@ class Criteria:
         raise_all(problems, "criteria")
 
 
-@dataclass(frozen=True)
 class Margin(Outcome):
     """A margin in pu volts or as a share of the pre-fault import; positive: met."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True)

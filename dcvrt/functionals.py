@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ from dcvrt.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Value of a functional, its gradient, and where it is active.
 
     Attributes
@@ -42,7 +41,7 @@ class Outcome:
     """
 
     value: float
-    grad: Mapping[str, float] = field(default_factory=dict)
+    grad: Mapping[str, float] = {}
     time: float = math.nan
     kind: str = ""
     tie: bool = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from dcvrt.criteria import Criteria, Margins, longest_window, margins_of, needed, only_criteria
 from dcvrt.curve import SAME_LENGTH, too_short
@@ -76,6 +77,11 @@ class Asked:
         unused = frozenset(n for n in under if n.removeprefix(UNDER_CRITERIA) not in WITH_GRADIENT)
         return cls(criteria, wanted, {**wanted, **under}, unused)
 
+    @cached_property
+    def _under(self) -> dict[str, str]:
+        """Functionals under the criteria, by the names that the criteria have for them."""
+        return {n.removeprefix(UNDER_CRITERIA): n for n in self.everything if n.startswith(UNDER_CRITERIA)}
+
     def answers(
         self, found: Mapping[str, Outcome], sequence: tuple[str, ...]
     ) -> tuple[Margins | None, dict[str, Outcome]]:
@@ -89,7 +95,7 @@ class Asked:
         answers = {name: found[name] for name in self.functionals}
         if self.criteria is None:
             return None, answers
-        under = {n.removeprefix(UNDER_CRITERIA): o for n, o in found.items() if n.startswith(UNDER_CRITERIA)}
+        under = {short: found[name] for short, name in self._under.items()}
         try:
             return margins_of(self.criteria, under, sequence), answers
         except InputError as error:

@@ -156,10 +156,10 @@ def _on_kernel(simulator: Simulator, waveforms: Sequence[Waveform], P: Array, as
         wanted = Table.of(asked.everything, values_only=asked.values_only) if asked.everything else None
         inputs = [tables[k][1] for k in started]
         ensemble = Ensemble(kernel, inputs, P[started], X[started], Z[started], wanted)
-        for number, k in enumerate(started):
+        for number, (k, found) in enumerate(zip(started, ensemble.outcomes(), strict=True)):
             status = ensemble.status(number)
             answers[k] = (
-                _Answer.of(asked, ensemble.outcomes(number), ensemble.sequence(number), None)
+                _Answer.of(asked, found, ensemble.sequence(number), None)
                 if status == COMPLETED
                 else _Answer(status)
             )
@@ -198,7 +198,9 @@ def _cases(
     for waveform in waveforms if not isinstance(waveforms, str) else [waveforms]:
         only_waveform(waveform)
     columns = {
-        k: list(v) for k, v in table.items() if not isinstance(v, (int, float)) and hasattr(v, "__len__")
+        k: [float(value) for value in v]
+        for k, v in table.items()
+        if not isinstance(v, (int, float)) and hasattr(v, "__len__")
     }
     lengths = {f"{k!r}": len(v) for k, v in columns.items()}
     if len(waveforms) != 1:
@@ -211,11 +213,9 @@ def _cases(
         raise InputError(f"batch: columns differ in length: {told}. Give one value for all or one per case.")
     n = next(iter(lengths.values()), 1)
     shared = {k: float(v) for k, v in table.items() if k not in columns}  # type: ignore[arg-type]
+    rows = zip(*columns.values(), strict=True) if columns else [()] * n
     cases = [
-        (
-            waveforms[0] if len(waveforms) == 1 else waveforms[k],
-            shared | {c: float(v[k]) for c, v in columns.items()},
-        )
-        for k in range(n)
+        (waveform, shared | dict(zip(columns, row, strict=True)))
+        for waveform, row in zip(waveforms if len(waveforms) > 1 else [*waveforms] * n, rows, strict=True)
     ]
     return cases, simulator.dae.parameter_cases([values for _, values in cases], "batch")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import addressof, byref, c_void_p, sizeof
 from typing import Any
@@ -112,9 +112,9 @@ class Ensemble:
         texts, rows = self.model.row_texts, self.events[case][:, 1].astype(int).tolist()
         return (*self.model.start_texts, *(texts[row] for row in rows))
 
-    def outcomes(self, case: int) -> Mapping[str, Outcome]:
-        """Functionals of a completed case."""
+    def outcomes(self) -> Iterable[Mapping[str, Outcome]]:
+        """Functionals of every case; of no use where it did not complete."""
         if self.table is None or self.found is None:
-            return {}
+            return [{}] * self.cases
         eq = self.model.equations
-        return self.found.outcomes(case, self.table, [c.name for c in eq.columns], eq.scale)
+        return self.found.outcomes(self.table, [c.name for c in eq.columns], eq.scale)

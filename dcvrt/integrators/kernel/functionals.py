@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,14 +129,13 @@ class Results:
     place: NDArray[np.uint8]
     tie: NDArray[np.uint8]
 
-    def outcomes(self, case: int, table: Table, wrt: Sequence[str], scale: Array) -> dict[str, Outcome]:
-        """Functionals of one case by name, derivatives by the thetas themselves."""
-        gradients = (self.gradient[case] / scale).tolist() if len(wrt) else [()] * len(table)
-        columns = (self.value, self.time, self.place, self.tie)
-        values, times, places, ties = (column[case].tolist() for column in columns)
-        return {
-            name: Outcome(value, dict(zip(wrt, gradient, strict=True)), time, PLACES[place], bool(tie))
-            for name, value, gradient, time, place, tie in zip(
-                table.names, values, gradients, times, places, ties, strict=True
-            )
-        }
+    def outcomes(self, table: Table, wrt: Sequence[str], scale: Array) -> Iterator[dict[str, Outcome]]:
+        """Functionals of every case by name, derivatives by the thetas themselves."""
+        places = np.array(PLACES, dtype=object)[self.place]
+        columns = (self.value, self.time, places, self.tie.astype(bool))
+        gradients = (self.gradient / scale).tolist() if len(wrt) else itertools.repeat([()] * len(table))
+        rows = zip(*(column.tolist() for column in columns), gradients, strict=False)
+        for values, times, kinds, ties, slopes in rows:
+            grads = [dict(zip(wrt, slope, strict=True)) if wrt else {} for slope in slopes]
+            outcomes = map(Outcome, values, grads, times, kinds, ties)
+            yield dict(zip(table.names, outcomes, strict=True))

@@ -7,6 +7,7 @@
 
 #include "functionals.h"
 
+#include <float.h>
 #include <math.h>
 
 enum between { AT_NODE = 0, OF_CUBIC = 1, OF_SOLUTION = 2 };
@@ -15,7 +16,10 @@ struct curve {
     const struct track *track;
     int signal, per;
     double sign;
+    double *node_y, *node_rate; /* [track->n], signal and rate at the nodes */
+    unsigned char *turns;       /* [track->n], whether the cubic from a node on may have an extremum inside */
     long n;                 /* knots */
+    long lowest;            /* the lowest knot */
     double *t, *y, *rate;   /* [n] */
     long *node;             /* [n], the node at a knot; the node before it where `between` */
     unsigned char *between; /* [n], whether the knot is an extremum between two nodes, enum between */
@@ -155,13 +159,31 @@ static double meets(const struct curve *c, long i, double level)
     return cross_between(c, &x, c->t[i], c->t[i + 1]);
 }
 
-/* Add the extrema of the cubic between nodes k and k + 1 as knots; `c->n` - 1 is the knot of node k. */
-static void add_extrema(struct curve *c, long k, double h, double y0, double r0, double y1, double r1)
+/* Signal and rate at all nodes, and where the cubics between them may turn; 0 if a number is not finite. */
+static int lay_nodes(struct curve *c)
 {
-    double rise = y1 - y0, m0 = r0 * h, m1 = r1 * h;
-    double up = rise > 0 ? 1.0 : -1.0;
-    if (up * m0 >= 0 && up * m1 >= 0 && higher(fabs(m0), fabs(m1)) <= 3 * fabs(rise))
-        return; /* surely monotone */
+    const double *t = c->track->t;
+    double *restrict y = c->node_y, *restrict rate = c->node_rate;
+    unsigned char *restrict turns = c->turns;
+    long n = c->track->n;
+    int finite = 1;
+    for (long k = 0; k < n; k++)
+        at_node(c, k, y + k, rate + k);
+    for (long k = 0; k < n; k++)
+        finite &= (fabs(y[k]) <= DBL_MAX) & (fabs(rate[k]) <= DBL_MAX);
+    for (long k = 0; k < n - 1; k++) {
+        double h = t[k + 1] - t[k], rise = y[k + 1] - y[k], m0 = rate[k] * h, m1 = rate[k + 1] * h;
+        int monotone = (rise * m0 >= 0) & (rise * m1 >= 0) & (higher(fabs(m0), fabs(m1)) <= 3 * fabs(rise));
+        turns[k] = !monotone;
+    }
+    return finite;
+}
+
+/* Add the extrema of the cubic between nodes k and k + 1 as knots; `c->n` - 1 is the knot of node k. */
+static void add_extrema(struct curve *c, long k)
+{
+    double h = c->track->t[k + 1] - c->track->t[k], y0 = c->node_y[k];
+    double rise = c->node_y[k + 1] - y0, m0 = c->node_rate[k] * h, m1 = c->node_rate[k + 1] * h;
     double c2 = 3 * rise - 2 * m0 - m1, c3 = m0 + m1 - 2 * rise, square = c2 * c2 - 3 * c3 * m0;
     if (!(square > 0))
         return;
@@ -181,27 +203,33 @@ static void add_extrema(struct curve *c, long k, double h, double y0, double r0,
         }
 }
 
+static long lowest_knot(const struct curve *c)
+{
+    long low = 0;
+    for (long i = 1; i < c->n; i++)
+        if (c->y[i] < c->y[low])
+            low = i;
+    return low;
+}
+
 /* Knots of the curve; 0 if the signal is not finite everywhere. */
 static int make_knots(struct curve *c)
 {
     const struct track *track = c->track;
-    double y0 = 0, r0 = 0;
     c->n = 0;
-    for (long k = 0; k < track->n; k++) {
-        double y1, r1, h = k ? track->t[k] - track->t[k - 1] : 0.0;
-        at_node(c, k, &y1, &r1);
-        if (!isfinite(y1) || !isfinite(r1))
-            return 0;
-        if (h > 0)
-            add_extrema(c, k - 1, h, y0, r0, y1, r1);
-        c->t[c->n] = track->t[k];
-        c->y[c->n] = y1;
-        c->rate[c->n] = r1;
-        c->node[c->n] = k;
-        c->between[c->n++] = AT_NODE;
-        y0 = y1;
-        r0 = r1;
+    if (!lay_nodes(c))
+        return 0;
+    for (long k = 0, last = track->n - 1; k <= last; k++) {
+        long i = c->n++;
+        c->t[i] = track->t[k];
+        c->y[i] = c->node_y[k];
+        c->rate[i] = c->node_rate[k];
+        c->node[i] = k;
+        c->between[i] = AT_NODE;
+        if (k < last && c->turns[k] && track->t[k + 1] > track->t[k])
+            add_extrema(c, k);
     }
+    c->lowest = lowest_knot(c);
     return 1;
 }
 
@@ -227,13 +255,11 @@ static double node_slope(const struct track *track, long k, int w)
 /* Third derivative of the cubic between nodes k and k + 1; 0 where there is none. */
 static double third_derivative(const struct curve *c, long k, double *h)
 {
-    double y0, y1, r0, r1;
+    const double *y = c->node_y + k, *rate = c->node_rate + k;
     *h = k >= 0 && k < c->track->n - 1 ? c->track->t[k + 1] - c->track->t[k] : 0.0;
     if (!(*h > 0))
         return 0.0;
-    at_node(c, k, &y0, &r0);
-    at_node(c, k + 1, &y1, &r1);
-    return 6 / (*h * *h) * (r0 + r1 - 2 * (y1 - y0) / *h);
+    return 6 / (*h * *h) * (rate[0] + rate[1] - 2 * (y[1] - y[0]) / *h);
 }
 
 /* How far the cubic from node k on may be off the solution, from how its neighbours differ from it. */

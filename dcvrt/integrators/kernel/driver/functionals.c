@@ -30,20 +30,11 @@ static void at_knot(struct curve *c, long i, struct outcome *out)
         out->gradient[w] += rate * node_slope(track, k, w);
 }
 
-static long lowest_knot(const struct curve *c)
-{
-    long low = 0;
-    for (long i = 1; i < c->n; i++)
-        if (c->y[i] < c->y[low])
-            low = i;
-    return low;
-}
-
 static void plain_minimum(struct curve *c, struct outcome *out)
 {
-    long low = lowest_knot(c), sharpened;
+    int sharpened;
     do { /* the extrema of cubics that could be the lowest of the solution, or tie with it */
-        double level = c->y[low];
+        double level = c->y[c->lowest];
         sharpened = 0;
         for (long i = 0; i < c->n; i++) {
             if (c->between[i] != OF_CUBIC || !(c->y[i] < level + LOOKED_AT))
@@ -54,10 +45,11 @@ static void plain_minimum(struct curve *c, struct outcome *out)
                 sharpened = 1;
             }
         }
-        low = lowest_knot(c);
+        if (sharpened)
+            c->lowest = lowest_knot(c);
     } while (sharpened);
     /* a tie is another place as low, with something clearly higher on the way there */
-    double level = c->y[low], highest = level;
+    double level = c->y[c->lowest], highest = level;
     int seen = 0;
     for (long i = 0; i < c->n; i++) {
         if (c->y[i] <= level + TIE) {
@@ -67,7 +59,7 @@ static void plain_minimum(struct curve *c, struct outcome *out)
         }
         highest = higher(highest, c->y[i]);
     }
-    at_knot(c, low, out);
+    at_knot(c, c->lowest, out);
 }
 
 /* -- sustained extrema ------------------------------------------------------------------------------- */
@@ -222,8 +214,8 @@ static int workspace_ready(struct workspace *workspace, const struct track *trac
                            struct scratch *s)
 {
     unsigned long knots = 3 * (unsigned long)track->n, nw = track->nw, m = 1 + nw, ny = track->ny;
-    unsigned long doubles = 3 * knots + 2 * ny * m + 3 * nw + 12 * m;
-    unsigned long size = doubles * sizeof(double) + 2 * knots * sizeof(long) + knots;
+    unsigned long nodes = (unsigned long)track->n, doubles = 3 * knots + 2 * nodes + 2 * ny * m + 3 * nw + 12 * m;
+    unsigned long size = doubles * sizeof(double) + 2 * knots * sizeof(long) + knots + nodes;
     if (workspace->size < size) {
         free(workspace->memory);
         workspace->size = 2 * size;
@@ -237,6 +229,8 @@ static int workspace_ready(struct workspace *workspace, const struct track *trac
     c->t = d, d += knots;
     c->y = d, d += knots;
     c->rate = d, d += knots;
+    c->node_y = d, d += nodes;
+    c->node_rate = d, d += nodes;
     c->outputs = d, d += 2 * ny * m;
     s->a = d, d += nw;
     s->b = d, d += nw;
@@ -257,6 +251,7 @@ static int workspace_ready(struct workspace *workspace, const struct track *trac
     c->node = (long *)d;
     c->queue = c->node + knots;
     c->between = (unsigned char *)(c->queue + knots);
+    c->turns = c->between + knots;
     return 1;
 }
 

@@ -25,11 +25,7 @@ struct window {
 /* Smallest stretch of knots around the lowest one that grows to the lower side and lasts the window. */
 static struct window grown_stretch(const struct curve *c, double length)
 {
-    long l = 0;
-    for (long i = 1; i < c->n; i++)
-        if (c->y[i] < c->y[l])
-            l = i;
-    long r = l, top = l;
+    long l = c->lowest, r = l, top = l;
     while (c->t[r] - c->t[l] < length) {
         int leftwards = r == c->n - 1 || (l > 0 && c->y[l - 1] < c->y[r + 1]);
         long next = leftwards ? --l : ++r;
