@@ -307,10 +307,11 @@ class Dae:
 
         Bound parameters and dwell times outside their range; pairs of rows without hysteresis.
         """
-        numbers = iter(np.array(self._together(values)).ravel())
+        numbers = iter(np.array(self._together(values)).ravel().tolist())
         problems = []
         for tied in self.tied:
-            if problem := refusal(tied.what, next(numbers), tied.unit, tied.bounds):
+            value, (low, high) = next(numbers), tied.bounds
+            if not low <= value <= high and (problem := refusal(tied.what, value, tied.unit, tied.bounds)):
                 problems.append(problem)
         for a in self.automata:
             for gap in a.gaps:

@@ -237,6 +237,5 @@ class KernelRun:
 
 def _by_theta(flat: Array, rows: int, scale: Array) -> Array:
     """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors."""
-    n = len(flat)
-    scaled = flat[:, rows:].reshape(n, len(scale), rows).transpose(0, 2, 1)
-    return np.ascontiguousarray(scaled) / scale
+    by_theta = flat[:, rows:] / np.repeat(scale, rows)
+    return by_theta.reshape(len(flat), len(scale), rows).transpose(0, 2, 1)

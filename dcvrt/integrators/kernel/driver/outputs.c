@@ -16,18 +16,21 @@ int outputs_on(const struct task *task, const struct phase *phases, long n, cons
     double inverse[AT_LEAST_ONE(NW)];
     for (int j = 0; j < NW; j++) inverse[j] = 1.0 / theta_scale[j];
     int thetas = y_theta ? NW : 0;
-    long laid[LANES];
+    long laid[LANES], present = -1;
     for (int l = 0; l < LANES; l++) courses[l].task = task, laid[l] = -1, f->loaded[l] = -1;
     f->at.z = f->z1, f->at.zs = f->zs1, f->at.d = d, f->at.ds = ds;
+    double m[AT_LEAST_ONE(FIXED)], mc[AT_LEAST_ONE(FIXED_COLUMNS * NW)];
     for (long first = 0; first < n; first += LANES) {
         for (int l = 0; l < LANES; l++) {
             long k = first + l < n ? first + l : n - 1;
-            struct course *c = courses + l;
-            if (laid[l] != phase[k]) {
-                const struct phase *p = phases + phase[k];
-                laid[l] = phase[k];
-                course_fixed(task->p, p->mode, p->dentry, c->m, c->mc);
-                lay_fixed(f, l, c->m, c->mc, p->entry);
+            const struct phase *p = phases + phase[k];
+            if (present != phase[k]) {
+                present = phase[k];
+                course_fixed(task->p, p->mode, p->dentry, m, mc);
+            }
+            if (laid[l] != present) {
+                laid[l] = present;
+                lay_fixed(f, l, m, mc, p->entry);
             }
             if (f->loaded[l] != piece[k]) load_piece(f, l, piece[k]);
             AT(f->t, l) = t[k];
@@ -52,7 +55,7 @@ int outputs_on(const struct task *task, const struct phase *phases, long n, cons
             for (int i = 0; i < NY; i++) {
                 y[k * NY + i] = AT(lane_y[i], l);
                 rate[k * NY + i] = AT(lane_rate[i], l);
-                for (int j = 0; j < NW && y_theta; j++) {
+                for (int j = 0; j < thetas; j++) {
                     y_theta[(k * NY + i) * NW + j] = *theta_at(ys, NY, j, i, l) * inverse[j];
                     rate_theta[(k * NY + i) * NW + j] = *theta_at(yrs, NY, j, i, l) * inverse[j];
                 }
