@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -61,6 +62,42 @@ class Signals:
     rate: Array | None = None
     sens: Array | None = None
     rate_sens: Array | None = None
+
+
+class LateSignals(Signals):
+    """Signals whose sensitivities are computed when they are first read.
+
+    Parameters
+    ----------
+    names, value, rate : as of :class:`Signals`.
+    slopes : returns `sens` and `rate_sens`; called once at most, then forgotten.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        value: Array,
+        rate: Array | None,
+        slopes: Callable[[], tuple[Array, Array | None]],
+    ) -> None:
+        self.__dict__.update(names=names, value=value, rate=rate, slopes=slopes)
+
+    @cached_property
+    def _found(self) -> tuple[Array, Array | None]:
+        return self.__dict__.pop("slopes")()  # type: ignore[no-any-return]
+
+    @property
+    def sens(self) -> Array:  # type: ignore[override]
+        """Derivatives of the values by every theta."""
+        return self._found[0]
+
+    @property
+    def rate_sens(self) -> Array | None:  # type: ignore[override]
+        """Derivatives of the rates by every theta."""
+        return self._found[1]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Signals, (self.names, self.value, self.rate, self.sens, self.rate_sens)
 
 
 class Sensitivities:

@@ -156,8 +156,16 @@ class InputTable:
         )
 
 
+class _Place:
+    """Memory of the driver as numpy takes it."""
+
+    def __init__(self, address: int | None, shape: tuple[int, ...], kind: str) -> None:
+        self.__array_interface__ = {"data": (address, False), "shape": shape, "typestr": kind, "version": 3}
+
+
 def view(pointer: Any, *shape: int) -> NDArray[Any]:
     """An array that the driver owns, in place: not to be used when the driver has freed it."""
+    kind = np.dtype(pointer._type_).str
     if 0 in shape:
-        return np.zeros(shape)
-    return np.ctypeslib.as_array(pointer, shape=shape)
+        return np.zeros(shape, dtype=kind)
+    return np.asarray(_Place(ctypes.cast(pointer, c_void_p).value, shape, kind))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from ctypes import byref
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from dcvrt.integrators.kernel.library import (
     view,
 )
 from dcvrt.integrators.kernel.model import ModelText
-from dcvrt.trajectory import COMPLETED, Event, Signals, Trajectory
+from dcvrt.trajectory import COMPLETED, Event, LateSignals, Signals, Trajectory
 
 Array = NDArray[np.float64]
 THETA_LOOSER, THETA_SHARE = 10.0, 0.1
@@ -213,18 +214,19 @@ class KernelRun:
         t = view(r.sample_t, n).copy()
         y, rate = (view(a, n, ny).copy() for a in (r.sample_y, r.sample_rate))
         x, z = view(r.sample_x, n, self.model.width), view(r.sample_z, n, eq.nz * (1 + eq.nw))
-        sens = rate_sens = x_sens = z_sens = None
-        if eq.nw:
-            piece, phase = view(r.sample_piece, n), view(r.sample_phase, n)
-            _, _, sens, rate_sens = self.outputs(t, x, z, piece, phase, True)
-            x_sens = _by_theta(x, eq.nx, eq.scale)
-            z_sens = _by_theta(z, eq.nz, eq.scale)
+        signals = [(dae.y_names, y, rate), (dae.x_names, x[:, : eq.nx].copy(), None)]
+        signals.append((dae.z_names, z[:, : eq.nz].copy(), None))
+        slopes = [self._output_slopes, *(partial(_by_theta, self, *of) for of in ((x, eq.nx), (z, eq.nz)))]
+        made = [
+            LateSignals(*given, by) if eq.nw else Signals(*given)
+            for given, by in zip(signals, slopes, strict=True)
+        ]
         breaks = view(r.dbreak, r.breaks, eq.nw) / (eq.scale if eq.nw else 1.0)
         return Trajectory(
             t=t,
-            outputs=Signals(dae.y_names, y, rate, sens, rate_sens),
-            states=Signals(dae.x_names, x[:, : eq.nx].copy(), None, x_sens),
-            algebraics=Signals(dae.z_names, z[:, : eq.nz].copy(), None, z_sens),
+            outputs=made[0],
+            states=made[1],
+            algebraics=made[2],
             events=self.events,
             status=self.status,
             parameters=dict(zip(dae.p_names, self.p.tolist(), strict=True)),
@@ -234,8 +236,18 @@ class KernelRun:
             name=name,
         )
 
+    def _output_slopes(self) -> tuple[Array, Array]:
+        """Derivatives of outputs and their rates by theta, on the samples."""
+        r, eq, n = self.record, self.model.equations, self.record.samples
+        x, z = view(r.sample_x, n, self.model.width), view(r.sample_z, n, eq.nz * (1 + eq.nw))
+        at = [view(r.sample_piece, n), view(r.sample_phase, n)]
+        _, _, sens, rate_sens = self.outputs(view(r.sample_t, n), x, z, *at, True)
+        return sens, rate_sens
 
-def _by_theta(flat: Array, rows: int, scale: Array) -> Array:
-    """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors."""
+
+def _by_theta(run: KernelRun, flat: Array, rows: int) -> tuple[Array, None]:
+    """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors, which live as
+    long as the run."""
+    scale = run.model.equations.scale
     by_theta = flat[:, rows:] / np.repeat(scale, rows)
-    return by_theta.reshape(len(flat), len(scale), rows).transpose(0, 2, 1)
+    return by_theta.reshape(len(flat), len(scale), rows).transpose(0, 2, 1), None
