@@ -519,6 +519,7 @@ static struct fleet *fleet_new(struct course *courses, const struct options *o)
     f->rtol = all_lanes(o->rtol);
     f->theta_rtol = all_lanes(o->theta_rtol);
     f->theta_share = all_lanes(o->theta_share);
+    method_prepare(f, o);
     f->watch_tolerance = all_lanes(o->watch_tolerance);
     f->watch_floor = all_lanes(WATCH_FLOOR * o->atol);
     f->inverse = all_lanes(1.0);

@@ -263,6 +263,8 @@ static real method_step(struct fleet *f)
     return worse(norm, off_between(f, per_step) * (1.0 / OFF_BETWEEN));
 }
 
+static void method_prepare(struct fleet *f, const struct options *o) { (void)f, (void)o; }
+
 /* Every step begins anew from the state. */
 static void method_restart(struct fleet *f, int lane, const double *rate) { (void)f, (void)lane, (void)rate; }
 static void method_accept(struct fleet *f, lanes_mask taken) { (void)f, (void)taken; }
