@@ -64,6 +64,10 @@ class Signals:
     rate_sens: Array | None = None
 
 
+Slopes = Callable[[], tuple[Array, Array | None]]
+"""Computes the sensitivities of signals and of their rates."""
+
+
 class LateSignals(Signals):
     """Signals whose sensitivities are computed when they are first read.
 
@@ -78,21 +82,23 @@ class LateSignals(Signals):
         names: tuple[str, ...],
         value: Array,
         rate: Array | None,
-        slopes: Callable[[], tuple[Array, Array | None]],
+        slopes: Slopes,
     ) -> None:
         self.__dict__.update(names=names, value=value, rate=rate, slopes=slopes)
 
     @cached_property
     def _found(self) -> tuple[Array, Array | None]:
-        return self.__dict__.pop("slopes")()  # type: ignore[no-any-return]
+        found: tuple[Array, Array | None] = self.__dict__["slopes"]()
+        del self.__dict__["slopes"]
+        return found
 
     @property
-    def sens(self) -> Array:  # type: ignore[override]
+    def sens(self) -> Array:
         """Derivatives of the values by every theta."""
         return self._found[0]
 
     @property
-    def rate_sens(self) -> Array | None:  # type: ignore[override]
+    def rate_sens(self) -> Array | None:
         """Derivatives of the rates by every theta."""
         return self._found[1]
 

@@ -19,6 +19,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -179,22 +180,37 @@ def build(
             "Set DCVRT_CACHE_DIR to one that can."
         ) from None
     with place as scratch:
-        made = Path(scratch) / "model.so"
         for name, content in files.items():
             (Path(scratch) / name).write_text(content, encoding="utf-8")
-        done = subprocess.run(
-            [*compiler.command, *flags, *(str(Path(scratch) / u) for u in units), "-o", str(made), "-lm"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        os.replace(_compile_and_link(compiler, flags, units, Path(scratch)), path)
+    return path
+
+
+def _compile_and_link(compiler: Compiler, flags: Sequence[str], units: Sequence[str], folder: Path) -> Path:
+    """Shared object of the units in a folder, compiled at the same time.
+
+    Raises
+    ------
+    InputError
+        the compiler fails; its own message is kept.
+    """
+
+    def call(*arguments: str) -> None:
+        command = [*compiler.command, *flags, *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise InputError(
                 f"The C compiler failed ({' '.join(compiler.command)}, exit code {done.returncode}):\n"
                 f"{done.stderr.strip()[-2000:]}\nSet CC to another compiler, or CC=none to interpret."
             )
-        os.replace(made, path)
-    return path
+
+    parts, made = [str(folder / unit) for unit in units], folder / "model.so"
+    if len(units) > 1:
+        with ThreadPoolExecutor(len(units)) as pool:
+            list(pool.map(lambda source: call("-c", source, "-o", f"{source}.o"), parts))
+        parts = [f"{source}.o" for source in parts]
+    call(*parts, "-o", str(made), "-lm")
+    return made
 
 
 def _clear_abandoned(folder: Path) -> None:

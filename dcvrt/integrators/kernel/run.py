@@ -28,7 +28,7 @@ from dcvrt.integrators.kernel.library import (
     view,
 )
 from dcvrt.integrators.kernel.model import ModelText
-from dcvrt.trajectory import COMPLETED, Event, LateSignals, Signals, Trajectory
+from dcvrt.trajectory import COMPLETED, Event, LateSignals, Signals, Slopes, Trajectory
 
 Array = NDArray[np.float64]
 THETA_LOOSER, THETA_SHARE = 10.0, 0.1
@@ -160,7 +160,7 @@ class KernelRun:
             self.keep = dll.keep_new()
         if not self.keep:
             raise MemoryError
-        self.result, self.record = model.library.Result(), Record()
+        self.result, self.record, self.sampled = model.library.Result(), Record(), False
         if not dll.keep_run(
             self.keep, byref(self.task), byref(options), byref(self.result), byref(self.record)
         ):
@@ -208,25 +208,23 @@ class KernelRun:
         """Signals on the samples, with samples added at corners of the outputs."""
         eq, r = self.model.equations, self.record
         corners = Corners(MISSED, SHARPER, POINTS, LEVELS)
-        if not self.model.library.dll.keep_samples(self.keep, byref(corners), byref(r)):
+        if not self.sampled and not self.model.library.dll.keep_samples(self.keep, byref(corners), byref(r)):
             raise MemoryError
+        self.sampled = True  # what signals read later stays where it is
         dae, n, ny = eq.dae, r.samples, eq.dae.y.numel()
         t = view(r.sample_t, n).copy()
         y, rate = (view(a, n, ny).copy() for a in (r.sample_y, r.sample_rate))
         x, z = view(r.sample_x, n, self.model.width), view(r.sample_z, n, eq.nz * (1 + eq.nw))
-        signals = [(dae.y_names, y, rate), (dae.x_names, x[:, : eq.nx].copy(), None)]
-        signals.append((dae.z_names, z[:, : eq.nz].copy(), None))
-        slopes = [self._output_slopes, *(partial(_by_theta, self, *of) for of in ((x, eq.nx), (z, eq.nz)))]
-        made = [
-            LateSignals(*given, by) if eq.nw else Signals(*given)
-            for given, by in zip(signals, slopes, strict=True)
-        ]
+
+        def signals(names: tuple[str, ...], values: Array, rates: Array | None, slopes: Slopes) -> Signals:
+            return LateSignals(names, values, rates, slopes) if eq.nw else Signals(names, values, rates)
+
         breaks = view(r.dbreak, r.breaks, eq.nw) / (eq.scale if eq.nw else 1.0)
         return Trajectory(
             t=t,
-            outputs=made[0],
-            states=made[1],
-            algebraics=made[2],
+            outputs=signals(dae.y_names, y, rate, self._output_slopes),
+            states=signals(dae.x_names, x[:, : eq.nx].copy(), None, partial(_by_theta, self, x, eq.nx)),
+            algebraics=signals(dae.z_names, z[:, : eq.nz].copy(), None, partial(_by_theta, self, z, eq.nz)),
             events=self.events,
             status=self.status,
             parameters=dict(zip(dae.p_names, self.p.tolist(), strict=True)),
@@ -240,14 +238,14 @@ class KernelRun:
         """Derivatives of outputs and their rates by theta, on the samples."""
         r, eq, n = self.record, self.model.equations, self.record.samples
         x, z = view(r.sample_x, n, self.model.width), view(r.sample_z, n, eq.nz * (1 + eq.nw))
-        at = [view(r.sample_piece, n), view(r.sample_phase, n)]
-        _, _, sens, rate_sens = self.outputs(view(r.sample_t, n), x, z, *at, True)
+        piece, phase = view(r.sample_piece, n), view(r.sample_phase, n)
+        _, _, sens, rate_sens = self.outputs(view(r.sample_t, n), x, z, piece, phase, True)
         return sens, rate_sens
 
 
 def _by_theta(run: KernelRun, flat: Array, rows: int) -> tuple[Array, None]:
-    """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors, which live as
-    long as the run."""
+    """Derivatives by the thetas themselves (samples, rows, thetas) from the driver's flat vectors, which live
+    as long as the run."""
     scale = run.model.equations.scale
     by_theta = flat[:, rows:] / np.repeat(scale, rows)
     return by_theta.reshape(len(flat), len(scale), rows).transpose(0, 2, 1), None
