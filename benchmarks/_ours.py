@@ -52,7 +52,12 @@ def single_runs(case: Case, wrt: tuple[str, ...], targets: tuple[float, ...], sa
             on_kernel = not isinstance(options(rtol), Casadi)  # CasADi's loop looks for events on its samples
             coarse = Simulator(case.dae, options(rtol), wrt=wrt, save_at=case.waveform.until)
             timed = fine if sampled or not on_kernel else coarse
-            return lambda: timed(case.waveform, **case.values), error
+
+            def once() -> object:
+                run = timed(case.waveform, **case.values)
+                return run.outputs.sens if sampled else run  # computed when they are read
+
+            return once, error
 
         found.append(walk(f"{name}{', samples every ms' if sampled else ''}", "dcvrt", measure, targets))
     return found

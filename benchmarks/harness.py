@@ -60,6 +60,12 @@ def pin() -> str:
     return f"one thread on processor {processor}"
 
 
+def spent() -> float:
+    """Processor time of this process and of the compilers that it ran, s."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 def seconds(call: Callable[[], Any], repeats: int = 5) -> float:
     """Least processor time of `repeats` calls, s, after one call that warms caches.
 

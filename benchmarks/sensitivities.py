@@ -7,7 +7,6 @@ largest value in the run. README.md in this folder says how it is measured and w
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +17,7 @@ from benchmarks._case import THETAS, Case
 from benchmarks._precision import COARSE, TOLERANCES, Curve, compare, walk
 from benchmarks.baselines import NotInstalled, generated, interpreted
 from benchmarks.baselines.jax_diffrax import Diffrax
-from benchmarks.harness import Result, least, result
+from benchmarks.harness import Result, least, result, spent
 from dcvrt import facility
 from dcvrt.functionals import SustainedMinimum
 from dcvrt.integrators import Casadi, Simulator
@@ -101,7 +100,7 @@ def baselines(case: Case, targets: tuple[float, ...], smoke: bool) -> Any:
 
 
 def compile_times(name: str, case: Case) -> list[Result]:
-    """From the equations to a first result, without any cache: wall time, s."""
+    """From the equations to a first result, without any cache: processor time with the compiler's, s."""
     options = next(iter((_ours.solvers() or _ours.reference_loop()).values()))
     rows = []
     for what, thetas in (
@@ -112,9 +111,9 @@ def compile_times(name: str, case: Case) -> list[Result]:
             before = os.environ.get("DCVRT_CACHE_DIR")
             os.environ["DCVRT_CACHE_DIR"] = folder
             try:
-                start = time.perf_counter()
+                start = spent()
                 Simulator(case.dae, options(1e-6), wrt=thetas)(case.waveform, **case.values)
-                ours = time.perf_counter() - start
+                ours = spent() - start
             finally:
                 os.environ.pop("DCVRT_CACHE_DIR")
                 if before is not None:

@@ -11,7 +11,6 @@ import ctypes
 import re
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from benchmarks._case import POINTS, Case
 from benchmarks._precision import Curve, walk
 from benchmarks.baselines import CannotRun, Solver
+from benchmarks.harness import spent
 from dcvrt.integrators import find_compiler
 from dcvrt.integrators.equations import Equations
 
@@ -113,7 +113,7 @@ class Generated:
             options["control_group_size"] = [points]
         if forward:
             options["nfwd"] = self.nw
-        start = time.perf_counter()
+        start = spent()
         integrator = ca.integrator("stretch", plugin, dae, 0.0, grid, options)
         generator = ca.CodeGenerator("baseline.c", {"with_header": False})
         generator.add(integrator)
@@ -122,8 +122,8 @@ class Generated:
         if found != 2:
             raise RuntimeError("the generated C sets its tolerances elsewhere: adapt this baseline")
         text = HEAD + text
-        self.library, self.compile_seconds = _compile(text, flags)
-        self.total_seconds = time.perf_counter() - start
+        self.library = _compile(text, flags)
+        self.total_seconds = spent() - start
         self.text_length = len(text)
 
     def arguments(self, cases: Sequence[Case]) -> tuple[Any, ...]:
@@ -244,20 +244,18 @@ def tabled(case: Case, stepped: Case) -> tuple[Array, Array, Array, Array, Array
     return np.array([len(p)]), case.X0[None].copy(), np.array(p), stepped.jump, table
 
 
-def _compile(text: str, flags: Sequence[str]) -> tuple[ctypes.CDLL, float]:
+def _compile(text: str, flags: Sequence[str]) -> ctypes.CDLL:
     compiler = find_compiler()
     if compiler is None:
         raise CannotRun("no C compiler")
     folder = Path(tempfile.mkdtemp(prefix="dcvrt-baseline-"))
     source, made = folder / "baseline.c", folder / "baseline.so"
     source.write_text(text, encoding="utf-8")
-    start = time.perf_counter()
     subprocess.run([*compiler.command, *flags, str(source), "-o", str(made), "-lm"], check=True)
-    took = time.perf_counter() - start
     library = ctypes.CDLL(str(made))
     library.bench_loop.restype = ctypes.c_longlong
     pointer, integer, real = ctypes.c_void_p, ctypes.c_longlong, ctypes.c_double
     library.bench_loop.argtypes = [
         integer, pointer, real, real, integer, pointer, integer, pointer, pointer, pointer, integer, pointer
     ]  # fmt: skip
-    return library, took
+    return library
