@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 import platform
 import re
 from functools import cache
-from math import cos, exp, sin
+from math import acos, cos, exp, sin, sqrt
 
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.interpolate import CubicHermiteSpline
 
 from dcvrt import facility
 from dcvrt.criteria import Criteria
 from dcvrt.dae import Dae
 from dcvrt.errors import InputError, ModelError, SimulationError
-from dcvrt.functionals import Functional, Integral, Minimum, SustainedMinimum
+from dcvrt.functionals import Functional, Integral, Maximum, Minimum, SustainedMinimum
 from dcvrt.integrators import Casadi, Kernel, NoCompilerWarning, Simulator, compiler, find_compiler
 from dcvrt.integrators.batch import BatchResult
 from dcvrt.integrators.equations import Equations
@@ -58,6 +60,40 @@ def oscillator() -> Dae:
     s = Sketch({"x": 1.0, "w": 0.0}, {"omega": 5.0})
     om = s.p["omega"]
     return s.dae({"x": om * s.x["w"], "w": -om * s.x["x"]}, {"x_out": s.x["x"]})
+
+
+# -- corners ------------------------------------------------------------------------------------------------
+
+CORNER_WIDTH, CORNER_OMEGA, CORNER_UNTIL = 1e-4, 20.0, 0.12
+
+
+def clipped() -> Dae:
+    """y' = 10 max(cos(omega t) - c, 0), smoothed over a width far below a step."""
+    s = Sketch({"x": 1.0, "w": 0.0, "y": 0.0}, {"c": 0.0})
+    above, om = s.x["x"] - s.p["c"], CORNER_OMEGA
+    rate = 5 * (above + ca.sqrt(above**2 + CORNER_WIDTH**2))
+    return s.dae({"x": om * s.x["w"], "w": -om * s.x["x"], "y": rate}, {"y_out": s.x["y"]})
+
+
+def clipped_at_end(c: float) -> float:
+    def rate(t: float) -> float:
+        above = cos(CORNER_OMEGA * t) - c
+        return 5 * (above + sqrt(above**2 + CORNER_WIDTH**2))
+
+    turn = acos(c) / CORNER_OMEGA
+    near = [turn + d for d in (-1e-3, -1e-4, -1e-5, 0.0, 1e-5, 1e-4, 1e-3)]
+    edges = [0.0, *(t for t in near if 0 < t < CORNER_UNTIL), CORNER_UNTIL]
+    return sum(quad(rate, a, b, epsabs=1e-14, epsrel=1e-12)[0] for a, b in itertools.pairwise(edges))
+
+
+def test_a_corner_between_the_stages_of_a_step_is_seen() -> None:
+    """Wherever it lies: the embedded estimate alone lets errors of 460 tolerances pass."""
+    levels, rtol = np.linspace(-0.6, 0.9, 401).tolist(), 1e-7
+    simulate = Simulator(clipped(), Kernel("dp5", rtol, rtol * 1e-2), start="given")
+    found = simulate.batch([flat(CORNER_UNTIL)], {"c": levels}, functionals={"y": Maximum("y_out")})
+    wanted = np.array([clipped_at_end(c) for c in levels])
+    errors = np.abs([f["y"].value for f in found.functionals] - wanted) / np.maximum(wanted, 1.0)
+    assert errors.max() < 100 * rtol
 
 
 # -- order --------------------------------------------------------------------------------------------------
@@ -511,3 +547,16 @@ def test_equal_equations_share_one_object() -> None:
         a(flat(5.0))
     assert sin(0.0) == 0.0
     assert exp(0.0) == 1.0
+
+
+def test_sensitivities_are_computed_when_they_are_read() -> None:
+    """Later runs do not change them, and a copy has them."""
+    simulate = Simulator(system("gfl"), Kernel(), ("beta", "H"))
+    runs = [simulate(wave(), beta=1.1 + 0.01 * k) for k in range(4)]
+    first = simulate(wave(), beta=1.1)
+    copy = pickle.loads(pickle.dumps(runs[1]))
+    for name in ("v_it", "p_g"):
+        assert np.array_equal(first.sens[name, "beta"], runs[0].sens[name, "beta"])
+        assert np.array_equal(copy.sens[name, "H"], runs[1].sens[name, "H"])
+    assert np.array_equal(first.states.sens, runs[0].states.sens)
+    assert runs[0].outputs.rate_sens.shape == (len(runs[0].t), len(runs[0].outputs.names), 2)
