@@ -1,4 +1,4 @@
-/* Crossings of a method whose dense output is less exact than its steps. Part of course.c. */
+/* Crossings of a method whose dense output is less exact than its steps. Part of crossing.c. */
 
 enum { MOST_AGAIN = 5 };
 #define NEAR_END 1e-5 /* of a step: so close to its end the dense output is as exact as the step */
