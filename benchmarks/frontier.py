@@ -26,9 +26,10 @@ from dcvrt.planning.requirement import EverySite
 from dcvrt.planning.search import Ask
 from dcvrt.planning.surrogate import MarginData, fit_surrogates
 from dcvrt.planning.sweep import sweep
+from dcvrt.planning.verdict import verdict
 from dcvrt.studies import Study
 from dcvrt.studies.frontier import coarse_samples
-from dcvrt.studies.phases import Setting
+from dcvrt.studies.setting import Setting
 
 PAPER = "paper's method"
 
@@ -133,7 +134,7 @@ class Counter:
         hosting = dict(zip(self.setting.sites, H, strict=True))
         n_open = sum(mw > 0 for mw in H)
         expected = n_open * len(self.setting.periods) * len(self.labels)
-        return bool(replay.verdict(rows, hosting, expected)["passed"])
+        return bool(verdict(rows, hosting, expected)["passed"])
 
 
 def _sampled(spent: Counter, gradients: bool) -> MarginData:

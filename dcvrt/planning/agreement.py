@@ -36,6 +36,8 @@ STEEP = 3e-4
 PASSES = 200
 """Linearisations before it is given up: with fewer limits that bind than sites they come nearer by a constant
 factor only."""
+TOGETHER = 300
+"""Hours that are solved at a time where only the nearest to a limit are looked at."""
 HALVINGS = 10
 """Halved steps towards sizes without a solution before they count as out of reach."""
 
@@ -200,13 +202,16 @@ class Agreement:
 
     def _glance(self, H: Floats, tangents: list[Tangent]) -> _Look:
         """Solve only the hours in which a tangent is met without room and the worst hour of each bus near a
-        limit: enough to see most limits that the screen lets be broken."""
+        limit, or the nearest hours of all: enough to see most limits that the screen lets be broken."""
         screen = self.screen
         rows = screen.near(H, 0.0)
         linear = screen.voltages(H, rows)
         room = screen.room(linear, rows)
         self.least_room = np.minimum(room.min(axis=0, initial=MARGIN), MARGIN)
-        worst = room.argmin(axis=1)
+        if self.thorough or not len(rows):
+            worst = room.argmin(axis=1)
+        else:  # where the screen was made elsewhere it may be wrong in many hours: mend them together
+            worst = np.argsort(self.least_room, kind="stable")[:TOGETHER]
         hours = np.unique(np.r_[worst, [t.hour for t in _tight(tangents, H)]].astype(np.int64))
         if not len(hours):
             hours = np.array([tangents[0].hour])

@@ -14,6 +14,7 @@ from dcvrt.errors import InfeasibleError, InputError, did_you_mean, raise_all
 from dcvrt.grid.network import Network
 from dcvrt.planning import monolith, report
 from dcvrt.planning.agreement import Agreement
+from dcvrt.planning.arguments import argument_faults, per_site, row_faults, unit_faults
 from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import FlowCut
 from dcvrt.planning.master import Cut, Master, Question, Solution
@@ -26,8 +27,6 @@ from dcvrt.planning.voltage_screen import HostedFlow, Tangent, VoltageScreen
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-SCREENS = ("relinearised", "one-shot")
-BASE_VIOLATIONS = ("error", "hold")
 VOLTAGE_ROW_TOLERANCE = 1e-10
 """Violation of a linear voltage limit below which no cut is added, pu."""
 TOTAL_TOLERANCE = 1e-7
@@ -104,13 +103,13 @@ class HostingProblem:
         hull: bool = True,
     ) -> None:
         sites = tuple(sites)
-        problems = _argument_faults(
+        problems = argument_faults(
             network, sites, hours, rating_scale, voltage, pf, voltage_screen, base_violations
         )
-        upper = _per_site("h_max", h_max, sites, problems)
-        lower = _per_site("min_size", min_size, sites, problems)
+        upper = per_site("h_max", h_max, sites, problems)
+        lower = per_site("min_size", min_size, sites, problems)
         problems += [] if security is None else security.faults(network)
-        problems += _unit_faults(network, hours)
+        problems += unit_faults(network, hours)
         problems += [
             f"min_size {low:g} MW at site {bus} exceeds its h_max {high:g} MW."
             for bus, low, high in zip(sites, lower, upper, strict=True)
@@ -265,7 +264,7 @@ class HostingProblem:
         rows = tuple(rows)
         objective = MaxTotal() if objective is None else objective
         lower, upper = self._box(bounds)
-        raise_all(_row_faults(rows, self.sites, rating), "requirement rows")
+        raise_all(row_faults(rows, self.sites, rating), "requirement rows")
         problems = objective.faults(self.sites) + ([] if rating is None else rating.faults())
         problems += [
             f"must_open names {bus!r}, which is not a site.{did_you_mean(bus, self.sites)}"
@@ -449,108 +448,3 @@ def _all_open(count: int) -> Solution:
 def _tangent_cut(tangent: Tangent) -> Cut:
     a, b = tangent.cut()
     return Cut(a, b, tangent)
-
-
-def _argument_faults(
-    network: Network,
-    sites: tuple[int, ...],
-    hours: Year,
-    rating_scale: float,
-    voltage: tuple[float, float] | None,
-    pf: float,
-    screen: str,
-    base: str,
-) -> list[str]:
-    known = set(network.bus.tolist())
-    problems = [
-        f"site {bus!r} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
-        for bus in sites
-        if bus not in known
-    ]
-    problems += [
-        f"wind bus {bus} is not a bus of {network.name}.{did_you_mean(bus, network.bus)}"
-        for bus in hours.wind
-        if bus not in known
-    ]
-    if not sites:
-        problems.append("needs at least one site.")
-    problems += [
-        f"site {bus} is listed more than once." for bus in sorted({b for b in sites if sites.count(b) > 1})
-    ]
-    if not 0 < rating_scale < np.inf:
-        problems.append(f"rating_scale is {rating_scale:g}; it must be a finite number above 0.")
-    if voltage is not None and not 0 < voltage[0] < voltage[1] < np.inf:
-        problems.append(f"voltage limits {voltage[0]:g} to {voltage[1]:g} pu must be positive and ascending.")
-    if not 0 < pf <= 1:
-        problems.append(f"pf is {pf:g}; it must be above 0 and at most 1.")
-    for name, value, choices in (
-        ("voltage_screen", screen, SCREENS),
-        ("base_violations", base, BASE_VIOLATIONS),
-    ):
-        if value not in choices:
-            problems.append(f"{name} {value!r} is unknown.{did_you_mean(value, choices)}")
-    return problems
-
-
-def _per_site(
-    name: str, value: float | Mapping[int, float], sites: tuple[int, ...], problems: list[str]
-) -> Floats:
-    """A size for every site, from one number or a mapping that names all sites."""
-    if isinstance(value, Mapping):
-        problems += [
-            f"{name} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
-            for bus in value
-            if bus not in sites
-        ]
-        problems += [f"{name} says nothing about site {bus}." for bus in sites if bus not in value]
-        sizes = np.array([float(value.get(bus, 0.0)) for bus in sites])
-    else:
-        sizes = np.full(len(sites), float(value))
-    problems += [
-        f"{name} of site {bus} is {mw:g} MW; it must be finite and not negative."
-        for bus, mw in zip(sites, sizes, strict=True)
-        if not 0 <= mw < np.inf
-    ]
-    return sizes
-
-
-def _unit_faults(network: Network, hours: Year) -> list[str]:
-    """Units with limits of their own in some hours that are unknown, or whose limits cross."""
-    units = network.generators
-    place = {name: k for k, name in enumerate(units.name)}
-    problems = []
-    for name in {**hours.p_min, **hours.p_max}:
-        if name not in place:
-            problems.append(f"unit {name!r} is not in {network.name}.{did_you_mean(name, units.name)}")
-            continue
-        low = hours.p_min.get(name, np.full(len(hours), units.p_min[place[name]]))
-        high = hours.p_max.get(name, np.full(len(hours), units.p_max[place[name]]))
-        crossed = np.flatnonzero(low > high)
-        if len(crossed):
-            k = crossed[0]
-            problems.append(
-                f"unit {name} has p_min {low[k]:g} MW above p_max {high[k]:g} MW in hour {hours.hours[k]}"
-                + (f" ({len(crossed)} hours in all)." if len(crossed) > 1 else ".")
-            )
-    return problems
-
-
-def _row_faults(rows: tuple[Row, ...], sites: tuple[int, ...], rating: Rating | None) -> list[str]:
-    problems = []
-    for row in rows:
-        named = [*row.coefficients, *row.rating, *([] if row.site is None else [row.site])]
-        problems += [
-            f"row {row.label!r} names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
-            for bus in dict.fromkeys(named)
-            if bus not in sites
-        ]
-        values = [*row.coefficients.values(), *row.rating.values()]
-        limits = [limit for limit in (row.lower, row.upper) if np.isnan(limit) or np.isfinite(limit)]
-        if not limits or not np.isfinite([*limits, *values]).all() or row.lower > row.upper:
-            problems.append(f"row {row.label!r} has a coefficient or a limit that is not finite.")
-        if row.rating and rating is None:
-            problems.append(
-                f"row {row.label!r} contains converter ratings, but none are asked for. "
-                "Way out: solve(..., rating=Rating(...))."
-            )
-    return problems

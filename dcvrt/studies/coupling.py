@@ -15,7 +15,7 @@ from typing import Any
 from dcvrt.planning import coupling
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.findings import SAME_SHARE
-from dcvrt.studies.phases import NO_VRT, Setting
+from dcvrt.studies.setting import NO_VRT, Setting
 from dcvrt.studies.store import Store, records
 
 PHASE = "coupling"

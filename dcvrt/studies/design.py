@@ -22,7 +22,7 @@ from dcvrt.planning.design import (
     need,
     parameter_problems,
 )
-from dcvrt.studies.phases import Setting, criteria
+from dcvrt.studies.setting import Setting, criteria
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -16,9 +16,10 @@ from dcvrt.planning.mechanism import mechanism
 from dcvrt.planning.requirement import EverySite, Requirement
 from dcvrt.planning.sampling import sample_hosting
 from dcvrt.planning.search import Ask, Found, Options
-from dcvrt.studies import phases, system_limit
+from dcvrt.studies import plans, simulations, system_limit
 from dcvrt.studies.campaign import Campaign
-from dcvrt.studies.phases import CANDIDATES, FRONTIER, Job, Setting
+from dcvrt.studies.setting import Setting
+from dcvrt.studies.simulations import CANDIDATES, FRONTIER, Job
 from dcvrt.studies.store import Store, records
 from dcvrt.waveform import Waveform
 
@@ -66,10 +67,10 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
     checked: dict[str, dict[str, Any]] = {}
     for row, one in zip([*rows, *limited], [*found, *within], strict=True):
         if row["hosting"] not in checked:
-            checked[row["hosting"]] = phases.power_flow(setting.problem, one.plan)
+            checked[row["hosting"]] = plans.power_flow(setting.problem, one.plan)
         row |= checked[row["hosting"]]
     with store.transaction():
-        store.put("hostings", [phases.plan_hosting(row) for row in rows])
+        store.put("hostings", [plans.plan_hosting(row) for row in rows])
         store.put("plans", rows)
         store.clear("system_plans")
         store.put("system_plans", limited)
@@ -134,7 +135,7 @@ def _state(store: Store, setting: Setting) -> str:
 
 
 def _plan_row(setting: Setting, found: Found) -> dict[str, Any]:
-    row = phases.plan_row(setting, METHOD, found.mode, found.beta, found.plan, found.closed, None)
+    row = plans.plan_row(setting, METHOD, found.mode, found.beta, found.plan, found.closed, None)
     return row | {"search": system_limit.told(found)}
 
 
@@ -171,7 +172,7 @@ class _Campaign:
                         closed=setting.closed,
                     )
                     jobs.append(Job(self._name(ask, "f"), request))
-        self.lost += phases.simulate(self.campaign, FRONTIER, jobs)
+        self.lost += simulations.simulate(self.campaign, FRONTIER, jobs)
         answers: list[Mapping[Run, Sequence[Exact]]] = []
         for ask, runs in questions:
             rows = records(store.margins(hosting=self._name(ask, "f")))
@@ -185,7 +186,7 @@ class _Campaign:
         for ask, _ in questions:
             self._enter(ask, "p", self.roles[1])
         plans = [(self._name(ask, "p"), ask.H, list(runs)) for ask, runs in questions]
-        self.lost += phases.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
+        self.lost += simulations.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
         return [
             exact_of(
                 [r for r in records(store.margins(hosting=name)) if (r["mode"], r["beta"]) in runs],
@@ -199,11 +200,11 @@ class _Campaign:
         return dict(zip(map(str, self.setting.sites), ask.H, strict=True))
 
     def _name(self, ask: Ask, kind: str) -> str:
-        return kind + phases.plan_name(self._by_site(ask))[1:]
+        return kind + plans.plan_name(self._by_site(ask))[1:]
 
     def _enter(self, ask: Ask, kind: str, role: str) -> None:
         """Enter a hosting vector, unless a plan has entered it."""
         store, name = self.campaign.store, self._name(ask, kind)
         if name not in set(store.hostings().name):
             by_site = {int(bus): mw for bus, mw in self._by_site(ask).items()}
-            store.put("hostings", [phases.hosting_row(name, role, "", by_site)])
+            store.put("hostings", [simulations.hosting_row(name, role, "", by_site)])

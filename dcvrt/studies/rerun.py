@@ -18,7 +18,7 @@ from dcvrt.planning.exact import Exact, Place, Run, exact_of
 from dcvrt.planning.frontier import frontiers
 from dcvrt.planning.requirement import EverySite
 from dcvrt.planning.search import Ask, Found, Options
-from dcvrt.studies.phases import Setting
+from dcvrt.studies.setting import Setting
 from dcvrt.waveform import Waveform
 
 GAIN = 1e-3

@@ -41,8 +41,8 @@ from dcvrt.studies.checks import SHARED
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.findings import SAME_SHARE
 from dcvrt.studies.frontier import METHOD
-from dcvrt.studies.phases import Setting, criteria, setting_of
 from dcvrt.studies.rerun import Reruns
+from dcvrt.studies.setting import Setting, criteria, setting_of
 from dcvrt.studies.store import Store, records
 from dcvrt.waveform import Waveform
 

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, coupling, frontier, outputs, phases, sensitivity
+from dcvrt.studies import checks, config, coupling, fits, frontier, outputs, plans, sensitivity, simulations
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
+from dcvrt.studies.setting import NO_VRT, Setting, criteria, setting_of
 from dcvrt.studies.store import Store, records
 
 if TYPE_CHECKING:
@@ -127,10 +128,10 @@ class Study:
                     # First, so that its hosting programme has no past: cuts kept from other solves move its
                     # optimum by 1e-4 MW, and a run that is gone on with would ask for other simulations.
                     lost = frontier.run_frontier(campaign, setting, reporter)
-                    lost += phases.run_samples(campaign, setting)
-                    fits = phases.run_fits(store, setting)
-                    phases.run_plans(store, setting, fits, reporter)
-                    lost += phases.run_replays(campaign, setting)
+                    lost += simulations.run_samples(campaign, setting)
+                    surrogates = fits.run_fits(store, setting)
+                    plans.run_plans(store, setting, surrogates, reporter)
+                    lost += simulations.run_replays(campaign, setting)
                     lost += coupling.run_coupling(campaign, setting)
                     frontier.run_mechanisms(store, setting)
                     lost += sensitivity.run_sensitivity(campaign, setting, reporter)
@@ -141,11 +142,11 @@ class Study:
         result.report()
         return result
 
-    def setting(self, file: StudyFile | None = None) -> phases.Setting:
+    def setting(self, file: StudyFile | None = None) -> Setting:
         """Hosting programme and periods of the study, or of a variation of its file."""
-        return phases.setting_of(self.file if file is None else file, self.folder)
+        return setting_of(self.file if file is None else file, self.folder)
 
-    def _note(self, store: Store, file: StudyFile, setting: phases.Setting, quick: bool) -> None:
+    def _note(self, store: Store, file: StudyFile, setting: Setting, quick: bool) -> None:
         """Write down what the study is and what it is made with."""
         parameters = {
             mode: file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
@@ -163,7 +164,7 @@ class Study:
                 sampling_engine=file.grid.engine,
                 seed=file.study.seed,
                 periods=setting.periods,
-                criteria=phases.criteria(file),
+                criteria=criteria(file),
                 sites=list(setting.sites),
                 sources=dict(setting.problem.year.sources),
                 network=setting.problem.network.name,
@@ -211,7 +212,7 @@ class Result:
         folder = Path(folder)
         with Store(folder / outputs.STORE) as store:
             plans, tasks = records(store.plans()), records(store.tasks())
-        unfinished = not plans or any(not p["replayed"] for p in plans if p["method"] != phases.NO_VRT)
+        unfinished = not plans or any(not p["replayed"] for p in plans if p["method"] != NO_VRT)
         if unfinished:
             raise InputError(
                 f"{folder}: the study is not finished. Way out: the same 'dcvrt study run' resumes it."
@@ -281,7 +282,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def prepare(file: StudyFile, setting: phases.Setting) -> dict[str, str]:
+def prepare(file: StudyFile, setting: Setting) -> dict[str, str]:
     """Let what is generated once per machine be generated here, before workers would do it at the same time.
 
     Returns

@@ -10,8 +10,8 @@ from typing import Any
 from dcvrt.planning.exact import Run
 from dcvrt.planning.requirement import Requirement, SystemLimit
 from dcvrt.planning.search import Found
-from dcvrt.studies import phases
-from dcvrt.studies.phases import Setting
+from dcvrt.studies import plans
+from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 
 ROLES = ("system search", "system candidate")
@@ -30,7 +30,7 @@ def wanted(setting: Setting) -> list[tuple[Run, Requirement]]:
 def plan_row(setting: Setting, limit: Requirement, found: Found) -> dict[str, Any]:
     """The row of `system_plans` of what was found, before its checks."""
     assert isinstance(limit, SystemLimit)
-    row = phases.plan_row(setting, "", found.mode, found.beta, found.plan, found.closed, None)
+    row = plans.plan_row(setting, "", found.mode, found.beta, found.plan, found.closed, None)
     del row["method"], row["carried_from"]
     return row | {
         "limit_name": limit.name,

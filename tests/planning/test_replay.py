@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from dcvrt.planning.replay import facility_rows, fault_label, lost_rows, modes_passed, verdict
+from dcvrt.planning.replay import facility_rows, fault_label, lost_rows, modes_passed
+from dcvrt.planning.verdict import verdict
 
 REQUEST = {
     "sites": [21, 75],

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from dcvrt.planning import replay
-from dcvrt.studies import frontier, phases
+from dcvrt.studies import frontier, plans, simulations
 from dcvrt.studies.campaign import Campaign, crew_of
 from dcvrt.studies.config import SystemLimitSection
-from dcvrt.studies.phases import Setting
 from dcvrt.studies.progress import Silent
+from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 from tests.planning.closed_form import Programme
 from tests.studies.synthetic import CORNER, PERIODS, SITES, SLOPE, checked_run, study_file
@@ -77,7 +77,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Put the closed form in place of simulations and AC power flow; the requests that it gets."""
     requests: list[dict[str, Any]] = []
     monkeypatch.setattr(replay, "check_hosting", answers(study_file("limits"), requests))
-    monkeypatch.setattr(phases, "power_flow", lambda problem, plan: {"ac_passed": 1, "ac_status": "made up"})
+    monkeypatch.setattr(plans, "power_flow", lambda problem, plan: {"ac_passed": 1, "ac_status": "made up"})
     return requests
 
 
@@ -102,5 +102,5 @@ def run(folder: Path, study: Setting) -> list[dict[str, Any]]:
     with Store(folder / "study.sqlite", write=True) as store, crew_of(1) as crew:
         campaign = Campaign(store, crew)
         assert frontier.run_frontier(campaign, study, Silent()) == []
-        assert phases.run_replays(campaign, study) == []
+        assert simulations.run_replays(campaign, study) == []
         return records(store.system_plans())

@@ -14,8 +14,10 @@ import numpy as np
 
 from dcvrt.planning import replay
 from dcvrt.planning.sampling import sample_hosting
-from dcvrt.studies import outputs, phases
+from dcvrt.planning.verdict import verdict
+from dcvrt.studies import fits, outputs, plans, simulations
 from dcvrt.studies.config import StudyFile, load
+from dcvrt.studies.setting import criteria
 from dcvrt.studies.store import Store, records
 
 SITES = (21, 75, 106, 108)
@@ -139,7 +141,7 @@ def make(
             store.put(
                 "hostings",
                 [
-                    phases.hosting_row(
+                    simulations.hosting_row(
                         key,
                         "sample",
                         "fit" if samples.fit[k] else "validation",
@@ -151,7 +153,7 @@ def make(
             store.put("margins", [{"hosting": key, **row} for row in rows])
         if lost:
             _lose(store, file)
-        phases.run_fits(store, setting)  # type: ignore[arg-type]
+        fits.run_fits(store, setting)  # type: ignore[arg-type]
         _plans(store, file, failing)
         _sensitivities(store, file)
         outputs.write_results(folder, store)
@@ -201,7 +203,7 @@ def _note(store: Store, file: StudyFile, periods: dict[str, Any]) -> None:
         engine="andes",
         seed=1,
         periods=periods,
-        criteria=phases.criteria(file),
+        criteria=criteria(file),
         sites=list(SITES),
         sources={"load": "made up", "wind": "made up"},
         network="ieee118",
@@ -250,7 +252,7 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
                 )
     for plan in plans:
         by_site = {int(b): mw for b, mw in plan["by_site"].items()}
-        store.put("hostings", [phases.hosting_row(plan["hosting"], "plan", "", by_site)])
+        store.put("hostings", [simulations.hosting_row(plan["hosting"], "plan", "", by_site)])
         if plan["method"] == "none":
             store.put("plans", [plan])
             continue
@@ -263,7 +265,7 @@ def _plans(store: Store, file: StudyFile, failing: bool) -> None:
         expected = int((H > 0).sum()) * len(file.period) * len(file.fault)
         if H.any():  # a plan of nothing is not replayed
             store.put("margins", [{"hosting": plan["hosting"], **row} for row in rows])
-        store.put("plans", [plan | replay.verdict(rows, by_site, expected) | {"replayed": 1}])
+        store.put("plans", [plan | verdict(rows, by_site, expected) | {"replayed": 1}])
         _waveforms(store, file, plan, rows)
 
 
@@ -351,7 +353,7 @@ def _plan(
         "method": method,
         "mode": mode,
         "beta": beta,
-        "hosting": phases.plan_name(H),
+        "hosting": plans.plan_name(H),
         "total_mw": sum(H.values()),
         "by_site": H,
         "binding": binding,

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from dcvrt.planning.reactive import Beyond, ReactiveExcess
-from dcvrt.studies import outputs, phases
+from dcvrt.studies import outputs, simulations
 from dcvrt.studies.findings import Findings
+from dcvrt.studies.plans import power_flow
 from dcvrt.studies.report import answer, caveats, hypotheses, plans
 from dcvrt.studies.store import Store, records
 from tests.studies.synthetic import CORNER, PERIODS, SITES, make, study_file
@@ -90,14 +91,14 @@ def test_power_flow_writes_the_excess_and_the_replay_keeps_it(folder: Path) -> N
         reactive=HOSTED,
         reactive_unhosted=UNHOSTED,
     )
-    row = phases.power_flow(SimpleNamespace(check_ac=lambda plan: verdict), None)  # type: ignore[arg-type]
+    row = power_flow(SimpleNamespace(check_ac=lambda plan: verdict), None)  # type: ignore[arg-type]
     change(folder, **row, replayed=0)
     setting = SimpleNamespace(
         file=study_file("again"), sites=SITES, periods=PERIODS, request=lambda *_, **__: {}
     )
     with Store(folder / "study.sqlite", write=True) as store:
         campaign = SimpleNamespace(store=store, run=lambda *_: [])
-        phases.run_replays(campaign, setting)  # type: ignore[arg-type]
+        simulations.run_replays(campaign, setting)  # type: ignore[arg-type]
     for plan in records(Findings(folder).plans):
         assert caveats.reactive_excess(plan) == HOSTED
         assert caveats.reactive_excess(plan, "unhosted") == UNHOSTED

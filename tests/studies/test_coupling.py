@@ -15,8 +15,8 @@ from dcvrt.studies import coupling, outputs
 from dcvrt.studies.campaign import Campaign, InProcess
 from dcvrt.studies.config import load
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.phases import hosting_row
 from dcvrt.studies.report import coupling as report
+from dcvrt.studies.simulations import hosting_row
 from dcvrt.studies.store import Store, records
 from tests.studies.synthetic import make
 

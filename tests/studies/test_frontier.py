@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from dcvrt.planning import replay
-from dcvrt.studies import frontier, phases
+from dcvrt.studies import frontier, simulations
 from dcvrt.studies.campaign import Campaign, crew_of
-from dcvrt.studies.phases import Setting
 from dcvrt.studies.progress import Silent
+from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 from tests.studies.stand_in import WORSE, answers, run, setting, stand_in
 from tests.studies.synthetic import CORNER, PERIODS, SITES, checked_run, study_file
@@ -102,7 +102,7 @@ def test_a_finished_search_is_not_made_again_until_a_task_is_opened(tmp_path: Pa
     run(tmp_path, every_site())
     assert asked == []
     with Store(tmp_path / "study.sqlite", write=True) as store:
-        key = next(t["hash"] for t in records(store.tasks()) if t["phase"] == phases.FRONTIER)
+        key = next(t["hash"] for t in records(store.tasks()) if t["phase"] == simulations.FRONTIER)
         store.set_task(key, "open")
     run(tmp_path, every_site())
     assert len(asked) == 1

@@ -13,12 +13,13 @@ import typer
 from dcvrt import cli
 from dcvrt.planning import replay
 from dcvrt.planning.requirement import SystemLimit
-from dcvrt.studies import outputs, phases
+from dcvrt.planning.verdict import limit_verdict
+from dcvrt.studies import outputs, plans
 from dcvrt.studies.comparison import comparison
 from dcvrt.studies.figures import system_limit as picture
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.phases import Setting
 from dcvrt.studies.report import system_limit as page
+from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 from dcvrt.studies.study import Result
 from dcvrt.studies.style import styled
@@ -145,7 +146,7 @@ def put_limits(store: Store, runs: list[tuple[str, float]]) -> None:
             by_site = {str(bus): hosted if bus == 75 else 0.0 for bus in SITES}
             store.put("system_plans", [{
                 "mode": mode, "beta": beta, "limit_name": f"{mw:g} MW", "limit_mw": mw, "limit_share": 0.0,
-                "hosting": phases.plan_name(by_site), "total_mw": hosted, "by_site": by_site, "binding": [],
+                "hosting": plans.plan_name(by_site), "total_mw": hosted, "by_site": by_site, "binding": [],
                 "closed": {}, "ac_passed": 1, "ac_status": "made up", "replayed": 1, "passed": passed,
                 "aggregate_loss_mw": lost, "losses": losses if hosted else [],
                 "search": {"candidates": 1, "refused": 0, "gap": 0.0, "settled": settled,
@@ -168,20 +169,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_verdict_counts_what_is_missing_and_what_has_no_result() -> None:
     limit = SystemLimit(BUSES, D, mw=30.0)
     fine = exact([10.0, 20.0, 0.0], [[0.1, 0.2]] * 3, [0.25, 1.0, 0.1])
-    found = replay.limit_verdict([fine], limit, 1)
+    found = limit_verdict([fine], limit, 1)
     assert found["passed"]
     assert found["aggregate_loss_mw"] == pytest.approx(0.8 * 22.5)
     assert found["losses"] == [
         {"period": "peak", "fault": "a", "loss_mw": pytest.approx(18.0), "limit_mw": 30.0, "whole": [75]}
     ]
-    assert not replay.limit_verdict([fine], limit, 2)["passed"]
-    assert replay.limit_verdict([fine], limit, 2)["n_failed"] == 1
+    assert not limit_verdict([fine], limit, 2)["passed"]
+    assert limit_verdict([fine], limit, 2)["n_failed"] == 1
     unknown = exact([10.0, 20.0, 0.0], [[0.1, 0.2], [np.nan, np.nan], [0.1, 0.2]], [0.25, np.nan, 0.1])
-    found = replay.limit_verdict([unknown], limit, 1)
+    found = limit_verdict([unknown], limit, 1)
     assert (found["passed"], found["n_failed"], found["aggregate_loss_mw"]) == (False, 1, None)
     too_much = exact([100.0, 20.0, 0.0], [[0.1, 0.2]] * 3, [0.25, 1.0, 0.1])
-    assert not replay.limit_verdict([too_much], limit, 1)["passed"]
-    assert replay.limit_verdict([], limit, 0)["passed"]
+    assert not limit_verdict([too_much], limit, 1)["passed"]
+    assert limit_verdict([], limit, 0)["passed"]
 
 
 def test_tables_tell_the_plans_and_their_verdicts(folder: Path) -> None:

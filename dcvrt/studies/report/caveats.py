@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from dcvrt.criteria import LIMITED_BEFORE_FAULT
 from dcvrt.planning.reactive import ReactiveExcess
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.phases import NO_VRT, REACTIVE
 from dcvrt.studies.rows import Row, binding, by_site, carried
+from dcvrt.studies.setting import NO_VRT, REACTIVE
 from dcvrt.studies.style import mode_name
 
 if TYPE_CHECKING:
