@@ -13,7 +13,7 @@ import pytest
 from dcvrt.errors import SimulationError
 from dcvrt.studies import outputs
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.report import hypotheses, write_report
+from dcvrt.studies.report import checks, hypotheses, write_report
 from dcvrt.studies.rows import verdict
 from dcvrt.studies.store import Store
 from tests.studies.synthetic import make
@@ -330,3 +330,17 @@ def test_forms_of_the_margins_stand_side_by_side(tmp_path: Path) -> None:
     for form in forms.values():
         assert f">{form['kept']}</td>" in table[table.index(f">{form['method']}<") :]
     assert "judged too with sampling.gradients = true" in page
+
+
+def test_margins_seen_from_one_side_are_counted_by_site() -> None:
+    said = [
+        "loss at bus 21, fault bus 25, 100 ms, gfl, beta 1: every sample misses it",
+        "loss at bus 21, fault bus 30, 100 ms, gfl, beta 1: every sample misses it",
+        "voltage at bus 21, fault bus 25, 100 ms, gfl, beta 1: every sample meets it",
+        "bus 75, fault bus 25, 100 ms, gfm, beta 1: no run of the fitting set has a margin",
+    ]
+    assert checks.counted(said) == [
+        "bus 75: 1 times no run of the fitting set has a margin",
+        "loss at bus 21: 2 times every sample misses it",
+        "voltage at bus 21: 1 times every sample meets it",
+    ]

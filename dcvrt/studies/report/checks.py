@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report.answer import TARGETS, false_passes
-from dcvrt.studies.report.page import Safe, figure, number, paragraph, section, table
+from dcvrt.studies.report.page import Safe, bullets, figure, number, paragraph, section, table
 from dcvrt.studies.style import mode_name
 
 
@@ -61,8 +64,10 @@ def validation(findings: Findings) -> Safe:
             [
                 paragraph(
                     f"Of {len(one_sided)} margins the fitting set has seen one side only, met or missed, or "
-                    "no result at all; a fit that says the other side extrapolates."
-                )
+                    "no result at all; a fit that says the other side extrapolates. By margin and site, over "
+                    "faults, modes and ratings:"
+                ),
+                bullets(counted(one_sided)),
             ]
             if one_sided
             else []
@@ -83,6 +88,12 @@ def validation(findings: Findings) -> Safe:
             "overpredictions; the shaded quadrant holds false passes, ringed in red.",
         ),
     )
+
+
+def counted(one_sided: Sequence[str]) -> list[str]:
+    """How many margins of each site have been seen from one side only, and from which."""
+    seen = Counter((text.split(", fault")[0], text.rsplit(": ", 1)[1]) for text in one_sided)
+    return [f"{where}: {count} times {why}" for (where, why), count in sorted(seen.items())]
 
 
 FORMS = {
