@@ -114,7 +114,7 @@ def test_a_finished_search_is_not_made_again_until_a_task_is_opened(tmp_path: Pa
 def test_no_search_where_none_is_asked_for(tmp_path: Path, asked: list) -> None:
     study = every_site()
     off = study.file.model_copy(update={"frontier": study.file.frontier.model_copy(update={"search": False})})
-    run(tmp_path, Setting(off, study.folder, study.problem, study.periods, study.no_vrt))
+    run(tmp_path, Setting(off, study.folder, study.problem, study.periods))
     assert plans_of(tmp_path) == []
     assert asked == []
 
