@@ -29,8 +29,14 @@ Flags = npt.NDArray[np.bool_]
 
 VOLTAGE_ROW_TOLERANCE = 1e-10
 """Violation of a linear voltage limit below which no cut is added, pu."""
+RESTARTS = 8
+"""Linearisations on the way from sizes at which all limits hold to a proposal, where the linear voltages
+allow nothing: made elsewhere, with units at other limits, they may understate."""
 TOTAL_TOLERANCE = 1e-7
 """Difference of two totals that does not matter, MW."""
+
+Settled = tuple[Solution, Certificate, VoltageInfo | None]
+"""An optimum, how its hours were certified, and how voltages agree."""
 
 
 class HostingProblem:
@@ -285,11 +291,11 @@ class HostingProblem:
 
     def _optimum(self, question: Question, thorough: bool = True) -> Plan:
         master = question.master()
-        hours, screen = self.certifier, self.screen
+        _, screen = self.certifier, self.screen  # both refuse a base case that breaks a limit, in this order
         master.cuts = [self._as_cut(cut) for cut in self._flow_cuts]
         if screen is not None:
             master.cuts += [_tangent_cut(screen.tangent(*key)) for key in self._voltage_keys]
-        best: tuple[Solution, Certificate, VoltageInfo | None] | None = None
+        best: Settled | None = None
         tried: set[tuple[bool, ...]] = set()
         gap = 0.0
         while True:
@@ -302,17 +308,54 @@ class HostingProblem:
                 break
             tried.add(tuple(chosen.open))
             floor = -np.inf if best is None else best[0].objective + TOTAL_TOLERANCE
-            repeat = self.voltage_screen == "relinearised"
-            agreement = None if screen is None else Agreement(screen, repeat, thorough)
-            settled = self._settle(master, chosen.open, floor, agreement)
-            if settled is not None:
-                best = settled, hours.certificate, None if agreement is None else agreement.info()
+            best = self._settled(master, chosen.open, floor, thorough) or best
             if not master.may_close:
                 break
+        while best is not None and self.reactive_limits and screen is not None and master.may_close:
+            wider = self._wider(master, best[0], thorough)
+            if wider is None:
+                break
+            best = wider
         if best is None:
             raise InfeasibleError(self._why_none(question, master))
         solution, certificate, voltage = best
         return report.plan(self, master, solution, certificate, voltage, gap)
+
+    def _settled(self, master: Master, is_open: Flags, floor: float, thorough: bool) -> Settled | None:
+        """Optimum for given open sites above `floor` with what is known of it, or None."""
+        repeat = self.voltage_screen == "relinearised"
+        agreement = None if self.screen is None else Agreement(self.screen, repeat, thorough)
+        found = self._settle(master, is_open, floor, agreement)
+        if found is None:
+            return None
+        return found, self.certifier.certificate, None if agreement is None else agreement.info()
+
+    def _least(self, master: Master, is_open: Flags) -> Floats | None:
+        """Smallest sizes of open sites that the requirement rows ask for, voltages aside."""
+        kept, master.cuts = master.cuts, [c for c in master.cuts if not isinstance(c.origin, Tangent)]
+        try:
+            return master.smallest(is_open)
+        finally:
+            master.cuts = kept
+
+    def _wider(self, master: Master, best: Solution, thorough: bool) -> Settled | None:
+        """A better plan that opens further sites, where only voltages linearised elsewhere spoke against it.
+
+        With reactive limits these may understate; so the choice is made without them, and they are made anew
+        on the way to its optimum, however low that seems in between.
+        """
+        kept = master.cuts  # the reasons of closed sites rest on them
+        for _ in range(len(self.sites)):
+            master.cuts = [cut for cut in master.cuts if not isinstance(cut.origin, Tangent)]
+            chosen = master.choose(beside=best.open)
+            if chosen is None or chosen.objective <= best.objective + TOTAL_TOLERANCE:
+                break
+            found = self._settled(master, chosen.open, -np.inf, thorough)
+            if found is not None and found[0].objective > best.objective + TOTAL_TOLERANCE:
+                return found
+            master.forbid(chosen.open)
+        master.cuts = kept
+        return None
 
     def _why_none(self, question: Question, master: Master) -> str:
         """Say why no plan exists: smallest sizes, or the requirement rows."""
@@ -337,15 +380,26 @@ class HostingProblem:
         self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None
     ) -> Solution | None:
         """Optimum for given open sites, all hours certified; None when there is none above `floor`."""
-        restarted = False
+        base: Floats | None = None  # sizes at which all limits hold
+        last: Floats | None = None
+        restarts = 0
         while True:
             solution = master.solve(is_open)
-            if solution is None and agreement is not None and not restarted:
-                restarted = True
-                if agreement.restart(np.where(is_open, master.lower, 0.0), master):
+            if solution is None and agreement is not None and restarts < RESTARTS:
+                restarts += 1
+                if base is None:
+                    point = self._least(master, is_open)
+                else:
+                    point = base if last is None else 0.5 * (base + last)
+                if point is not None and agreement.restart(point, master):
+                    base = point
+                    continue
+                if base is not None:
+                    last = point
                     continue
             if solution is None or solution.objective <= floor:
                 return None
+            last = solution.H
             if agreement is not None:
                 violated = agreement.screen.violated(solution.H, VOLTAGE_ROW_TOLERANCE)
                 if violated:

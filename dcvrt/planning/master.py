@@ -163,6 +163,7 @@ class Master:
         self.sites, self.lower, self.upper, self.rows = tuple(sites), lower, upper, tuple(rows)
         self.must_open = np.zeros(n, dtype=bool) if must_open is None else must_open
         self.cuts: list[Cut] = []
+        self._forbidden: list[Flags] = []
         self._rated = 0 if rating is None else n
         least = isinstance(objective, MaxMin)
         weight = objective.vector(sites)
@@ -204,19 +205,36 @@ class Master:
         self.may_close = relief or bool(((lower > 0) & ~self.must_open).any())
         """Whether closing a site can help; if not, the programme is linear."""
 
-    def choose(self) -> Solution | None:
-        """Best choice of open sites under the cuts so far, or None when there is none."""
+    def forbid(self, is_open: Flags) -> None:
+        """Leave out a choice of open sites from now on."""
+        self._forbidden.append(is_open.copy())
+
+    def choose(self, beside: Flags | None = None) -> Solution | None:
+        """Best choice of open sites under the cuts so far, or None when there is none.
+
+        With `beside`, the best that opens all of these sites and at least one more.
+        """
         if not self.may_close:
             return self.solve(np.ones(self.count, dtype=bool))
         n, width = self.count, len(self.names)
         cuts, choice = self._cut_block(), self.with_choice()
+        forced = self.must_open if beside is None else self.must_open | beside
+        more = 0 if beside is None else int(beside.sum()) + 1
+        other = np.array([np.where(no, -1.0, 1.0) for no in self._forbidden]).reshape(-1, n)
         found = _run(
             np.r_[self.cost, np.zeros(n)],
-            np.r_[np.zeros(width), self.must_open.astype(float)],
+            np.r_[np.zeros(width), forced.astype(float)],
             np.r_[self._column_upper(self.upper), np.ones(n)],
-            np.vstack([np.hstack([cuts.matrix, np.zeros((len(cuts.low), n))]), choice.matrix]),
-            np.r_[cuts.low, choice.low],
-            np.r_[cuts.high, choice.high],
+            np.vstack(
+                [
+                    np.hstack([cuts.matrix, np.zeros((len(cuts.low), n))]),
+                    choice.matrix,
+                    np.r_[np.zeros(width), np.ones(n)],
+                    np.hstack([np.zeros((len(other), width)), other]),
+                ]
+            ),
+            np.r_[cuts.low, choice.low, more, [1.0 - no.sum() for no in self._forbidden]],
+            np.r_[cuts.high, choice.high, n, np.full(len(other), np.inf)],
             np.r_[np.zeros(width, bool), np.ones(n, bool)],
         )
         if found is None:
@@ -234,6 +252,17 @@ class Master:
             nothing,
             nothing,
         )
+
+    def smallest(self, is_open: Flags) -> Floats | None:
+        """Sizes of the least total for given open sites, or None when they cannot all be open."""
+        if not self.cuts and not len(self.without_choice(is_open)[0].low):
+            return np.where(is_open, self.lower, 0.0)
+        kept, self.cost = self.cost, np.r_[-np.ones(self.count), np.zeros(len(self.names) - self.count)]
+        try:
+            found = self.solve(is_open)
+        finally:
+            self.cost = kept
+        return None if found is None else found.H
 
     def with_choice(self) -> Block:
         """All rows but the cuts over [columns, z]."""
@@ -403,7 +432,10 @@ def _run(
     import highspy
 
     # Rows are scaled to a largest coefficient of 1, so that the solver's tolerance is one in MW.
-    size = np.maximum(abs(matrix).max(axis=1, initial=0.0), 1e-300)
+    size = abs(matrix).max(axis=1, initial=0.0)
+    moot = size == 0.0  # a voltage that no capacity moves, linearised where it was lower
+    size[moot] = 1.0
+    low, high = np.where(moot, -np.inf, low), np.where(moot, np.inf, high)
     scaled = sp.csr_matrix(matrix / size[:, None])
     solver = _shared()
     solver.clearModel()

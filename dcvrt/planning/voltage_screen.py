@@ -263,8 +263,9 @@ class VoltageScreen:
             hour = over.argmax(axis=1)
             worst = over[np.arange(len(rows)), hour]
             for k in np.argsort(-worst, kind="stable")[:BUSES_A_ROUND].tolist():
-                if worst[k] > tolerance:
-                    found.append(self.tangent(int(rows[k]), int(hour[k]), side))
+                tangent = self.tangent(int(rows[k]), int(hour[k]), side)
+                if worst[k] > tolerance and tangent.slope.any():  # else no capacity moves it: AC has the word
+                    found.append(tangent)
         return found
 
     def relinearise(

@@ -8,7 +8,7 @@ import pytest
 from dcvrt.grid import schedule
 from dcvrt.grid.network import Network
 from dcvrt.grid.powerflow import PowerFlow
-from dcvrt.planning import HostingProblem, profiles
+from dcvrt.planning import HostingProblem, Row, profiles
 from dcvrt.planning.agreement import GUARD
 from dcvrt.planning.interpolation import VoltageDrop
 from dcvrt.planning.voltage_screen import HostedFlow
@@ -126,3 +126,19 @@ def test_what_the_network_cannot_host_is_not_allowed() -> None:
     assert problem.allows({})
     for bus, mw in plan.by_site.items():
         assert not problem.allows(plan.by_site | {bus: 1.05 * mw}), bus
+
+
+@pytest.mark.parametrize("thorough", [True, False])
+def test_a_site_that_has_to_be_large_is_opened_whatever_was_solved_before(thorough: bool) -> None:
+    """Voltages linearised where it hosted nothing understate those at its size, as units at lower limits
+    come back to their set points; they must not keep it closed."""
+    rows = (Row({75: 1.0}, 60.0, "large enough", 75), Row({106: 1.0}, 40.0, "large enough", 106))
+    free = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6).solve()
+    assert free.by_site[75] > 60.0
+    assert free.by_site[106] > 40.0  # so the rows take nothing away
+    problem = HostingProblem(NETWORK, SITES, WEEK, rating_scale=0.6)
+    for before in ({}, {75: (0.0, 0.0)}, dict.fromkeys(SITES, (0.0, 0.0)), {106: (0.0, 45.0)}):
+        problem.solve(bounds=before)
+        plan = problem.solve(rows=rows, thorough=thorough)
+        assert plan.total_mw == pytest.approx(free.total_mw, abs=2e-3)
+        assert not plan.closed
