@@ -196,7 +196,10 @@ class Agreement:
         A linearisation made elsewhere can understate voltages where a unit leaves its reactive limit.
         """
         tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
-        look = self._look(H, tangents)
+        try:
+            look = self._look(H, tangents)
+        except SimulationError:
+            return False
         self._move(H, look, master)
         return self._overstates(look) <= AGREED_AT_LIMITS
 

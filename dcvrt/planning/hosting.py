@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.errors import InfeasibleError, InputError, did_you_mean, raise_all
+from dcvrt.errors import InfeasibleError, InputError, SimulationError, did_you_mean, raise_all
 from dcvrt.grid.network import Network
 from dcvrt.planning import monolith, report
 from dcvrt.planning.agreement import Agreement
@@ -350,7 +350,10 @@ class HostingProblem:
             chosen = master.choose(beside=best.open)
             if chosen is None or chosen.objective <= best.objective + TOTAL_TOLERANCE:
                 break
-            found = self._settled(master, chosen.open, -np.inf, thorough)
+            try:
+                found = self._settled(master, chosen.open, -np.inf, thorough)
+            except SimulationError:  # no power flow on the way: this choice is not to be had
+                found = None
             if found is not None and found[0].objective > best.objective + TOTAL_TOLERANCE:
                 return found
             master.forbid(chosen.open)
