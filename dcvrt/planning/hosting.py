@@ -311,7 +311,8 @@ class HostingProblem:
             best = self._settled(master, chosen.open, floor, thorough) or best
             if not master.may_close:
                 break
-        while best is not None and self.reactive_limits and screen is not None and master.may_close:
+        widens = thorough and self.reactive_limits and screen is not None and master.may_close
+        while best is not None and widens:
             wider = self._wider(master, best[0], thorough)
             if wider is None:
                 break
