@@ -190,8 +190,7 @@ class Agreement:
         return False
 
     def restart(self, H: Floats, master: Master) -> bool:
-        """Move the screen to the smallest sizes of open sites, where the master found no plan; whether there
-        all limits hold.
+        """Move the screen to some sizes, where the master found no plan; whether all limits hold at these.
 
         A linearisation made elsewhere can understate voltages where a unit leaves its reactive limit.
         """

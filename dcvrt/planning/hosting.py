@@ -313,7 +313,7 @@ class HostingProblem:
                 break
         widens = thorough and self.reactive_limits and screen is not None and master.may_close
         while best is not None and widens:
-            wider = self._wider(master, best[0], thorough)
+            wider = self._wider(master, best[0])
             if wider is None:
                 break
             best = wider
@@ -339,7 +339,7 @@ class HostingProblem:
         finally:
             master.cuts = kept
 
-    def _wider(self, master: Master, best: Solution, thorough: bool) -> Settled | None:
+    def _wider(self, master: Master, best: Solution) -> Settled | None:
         """A better plan that opens further sites, where only voltages linearised elsewhere spoke against it.
 
         With reactive limits these may understate; so the choice is made without them, and they are made anew
@@ -352,7 +352,7 @@ class HostingProblem:
             if chosen is None or chosen.objective <= best.objective + TOTAL_TOLERANCE:
                 break
             try:
-                found = self._settled(master, chosen.open, -np.inf, thorough)
+                found = self._settled(master, chosen.open, -np.inf, thorough=True)
             except SimulationError:  # no power flow on the way: this choice is not to be had
                 found = None
             if found is not None and found[0].objective > best.objective + TOTAL_TOLERANCE:
