@@ -82,9 +82,9 @@ def plan_row(
     H = {str(bus): round(plan.by_site[bus], 6) + 0.0 for bus in setting.sites}
     # A closed site is told as such, not as one whose largest size is 0; other bounds are those of the sampled
     # box.
+    edge = "sampled box" if method in setting.file.surrogate.methods else "trust region of the search"
     binding = [
-        asdict(b)
-        | ({"label": f"sampled box at site {b.bus}"} if b.kind == "bound" and method != NO_VRT else {})
+        asdict(b) | ({"label": f"{edge} at site {b.bus}"} if b.kind == "bound" and method != NO_VRT else {})
         for b in plan.binding
         if not (b.kind == "bound" and b.bus in closed)
     ]

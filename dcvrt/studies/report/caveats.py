@@ -73,7 +73,7 @@ def lower_bounds(findings: Findings) -> list[str]:
     for row in findings.rows():
         if row["total_mw"] < findings.no_vrt_mw - findings.tolerance_mw:
             for entry in binding(row):
-                if entry["kind"] == "bound":
+                if entry["label"].startswith("sampled box"):
                     found.setdefault((row["mode"], row["method"], entry["bus"]), []).append(row)
     return [
         f"{mode_name(mode)}, method {method}, β = {_ratings(rows)}: bus {bus} stands at {_sizes(rows, bus)} "
