@@ -188,11 +188,12 @@ def _closed(
             others = len(broken) - 1
             more = f", and {others} more margin{'s' * (others > 1)} fall{'s' * (others == 1)} short"
             room, worst = broken[0]
-            short = f"{-room:.4g} {worst.unit}".rstrip()
-            reasons[bus] = (
-                f"{worst.label}: {short} short at {opened[bus]:g} MW beside the other sites"
-                f"{more if others else ''}"
+            short = (
+                f": {-room:.4g} {worst.unit}".rstrip()
+                + f" short at {opened[bus]:g} MW beside the other sites"
             )
+            said = short if any([*worst.coefficients.values(), *worst.rating.values()]) else ""
+            reasons[bus] = f"{worst.label}{said}{more if others else ''}"
         elif master.upper[i] == 0:
             reasons[bus] = "its largest size is 0 MW"
         elif (alone := _alone(master, i)) < master.lower[i]:

@@ -339,3 +339,8 @@ def test_a_proposal_beyond_the_nose_is_left_for_the_voltage_limit(v_min: float, 
     hosted = 100.0 * np.sqrt(1.0 - (2.0 * v_min**2 - 1.0) ** 2) / (2.0 * x)
     assert plan.total_mw == pytest.approx(hosted, rel=1e-5)
     assert problem.check_ac(plan).passed
+
+
+def test_a_row_that_no_size_meets_closes_its_site_with_its_own_words(problem: HostingProblem) -> None:
+    plan = problem.solve([Row({75: 0.0}, 1.0, "no margin known at 75: it did not start", 75)])
+    assert plan.closed[75] == "no margin known at 75: it did not start"
