@@ -175,7 +175,8 @@ class HostingProblem:
             closed and `plan.closed` says so.
         bounds : mapping of bus number to (low, high), optional
             Range in which an open site must lie, MW, for instance the sampled domain of a surrogate or a
-            trust region; it narrows `min_size` and `h_max`.
+            trust region; it narrows `min_size` and `h_max`. A range from 0 to less than `min_size` closes
+            the site.
         objective : MaxTotal or MaxMin, optional
             Default the plain total.
         rating : Rating, optional
@@ -438,6 +439,8 @@ class HostingProblem:
             else:
                 i = self.sites.index(bus)
                 lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
+                if low == 0.0 and high < self.lower[i]:
+                    lower[i] = upper[i] = 0.0
                 if lower[i] > upper[i]:
                     problems.append(
                         f"the range of site {bus}, {low:g} to {high:g} MW, has nothing in common with "

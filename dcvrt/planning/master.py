@@ -27,7 +27,14 @@ def highs() -> highspy.Highs:
     """A silent, single-threaded, exact HiGHS."""
     import highspy
 
-    solver = highspy.Highs()
+    class Silent(highspy.Highs):
+        """Version 1.16 prints its banner while it is made, before a caller can set an option."""
+
+        def enableCallbacks(self) -> None:
+            self.setOptionValue("output_flag", False)
+            super().enableCallbacks()
+
+    solver = Silent()
     for option, value in (
         ("output_flag", False),
         ("threads", 1),

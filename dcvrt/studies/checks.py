@@ -101,15 +101,8 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
                 "grid.coupling = 'closed': grid.engine = 'andes' has no model of a facility. Way out: "
                 "grid.engine = 'native', or coupling = 'open'."
             )
+        problems += wrong_sizes(sections, grid.sites)
         sampling: SamplingSection | None = sections.get("sampling")
-        if (
-            sampling is not None
-            and sampling.h_max_mw is not None
-            and len(sampling.h_max_mw) != len(grid.sites)
-        ):
-            problems.append(
-                f"sampling.h_max_mw: {len(sampling.h_max_mw)} values for {len(grid.sites)} sites."
-            )
         if sampling is not None:
             kept, needed = (
                 sampling.n - max(1, round(sampling.validation_share * sampling.n)),
@@ -168,6 +161,35 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
             f"facility.modes: {mode!r} is listed more than once." for mode in _repeated(facility.modes)
         ]
     return problems + wrong_limits(sections)
+
+
+def wrong_sizes(sections: Mapping[str, Any], sites: Sequence[int]) -> list[str]:
+    """Sizes by site that are too many or too few, and sites whose least size exceeds the largest."""
+    hosting: HostingSection | None = sections.get("hosting")
+    sampling: SamplingSection | None = sections.get("sampling")
+    largest = None if hosting is None else hosting.h_max_mw
+    least = None if hosting is None else hosting.min_size_mw
+    given = {
+        "hosting.h_max_mw": largest,
+        "hosting.min_size_mw": least,
+        "sampling.h_max_mw": None if sampling is None else sampling.h_max_mw,
+    }
+    problems = [
+        f"{name}: {len(sizes)} values for {len(sites)} sites."
+        for name, sizes in given.items()
+        if isinstance(sizes, list) and len(sizes) != len(sites)
+    ]
+    if problems or largest is None or least is None:
+        return problems
+    return [
+        f"hosting.min_size_mw: {low:g} MW at site {bus} exceeds its h_max_mw {high:g} MW."
+        for bus, low, high in zip(sites, _each(least, sites), _each(largest, sites), strict=True)
+        if low > high
+    ]
+
+
+def _each(sizes: float | Sequence[float], sites: Sequence[int]) -> Sequence[float]:
+    return sizes if isinstance(sizes, Sequence) else [sizes] * len(sites)
 
 
 def wrong_limits(sections: Mapping[str, Any]) -> list[str]:

@@ -80,6 +80,22 @@ class HostingSection(Section):
         default=True,
         description="whether units keep within their reactive limits, in normal operation and before a fault",
     )
+    h_max_mw: NotNegative | list[NotNegative] = Field(
+        default=500.0, description="largest capacity of a site: one number, or one for every site"
+    )
+    min_size_mw: NotNegative | list[NotNegative] = Field(
+        default=0.0, description="smallest capacity that is worth opening a site: one number, or one a site"
+    )
+    n1_rating_factor: Positive | None = Field(
+        default=None,
+        description="factor on the ratings that holds after the outage of any one branch; default: outages "
+        "are not looked at",
+    )
+    base_violations: Literal["error", "hold"] = Field(
+        default="error",
+        description="voltages outside the limits with nothing hosted: refused, or 'hold': they must only not "
+        "get worse",
+    )
 
 
 class FaultEntry(Section):

@@ -14,6 +14,7 @@ from dcvrt.planning import replay
 from dcvrt.planning.hosting import HostingProblem
 from dcvrt.planning.plan import Plan
 from dcvrt.planning.sampling import Samples, sample_hosting
+from dcvrt.planning.security import N1
 from dcvrt.studies import checks
 from dcvrt.studies.config import StudyFile
 
@@ -122,6 +123,10 @@ class Setting:
         return [(mode, beta) for mode in self.file.facility.modes for beta in self.file.facility.beta]
 
 
+def _by_site(sizes: float | list[float], sites: list[int]) -> float | dict[int, float]:
+    return dict(zip(sites, sizes, strict=True)) if isinstance(sizes, list) else sizes
+
+
 def setting_of(file: StudyFile, folder: Path) -> Setting:
     """Hosting programme and periods of a study whose relative paths start from a folder."""
     network, problems = checks.read_network(file.grid, folder)
@@ -136,7 +141,11 @@ def setting_of(file: StudyFile, folder: Path) -> Setting:
         rating_scale=h.rating_scale,
         voltage=(h.v_min_pu, h.v_max_pu),
         pf=h.pf,
+        h_max=_by_site(h.h_max_mw, file.grid.sites),
+        min_size=_by_site(h.min_size_mw, file.grid.sites),
+        security=None if h.n1_rating_factor is None else N1(h.n1_rating_factor),
         reactive_limits=h.reactive_limits,
+        base_violations=h.base_violations,
     )
     chosen = year.representative(network)
     periods = {}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -297,6 +299,22 @@ def test_voltages_outside_the_limits_before_hosting_are_named() -> None:
         "Ways out: wider limits (voltage=...), other set points, or base_violations='hold', with which "
         "these voltages must only not get worse."
     )
+
+
+def test_a_range_below_the_least_size_closes_a_site() -> None:
+    problem = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, min_size=25.0, reactive_limits=False)
+    plan = problem.solve(bounds={75: (0.0, 24.0), 106: (0.0, 30.0)})
+    assert plan.by_site[75] == 0.0
+    assert 25.0 <= plan.by_site[106] <= 30.0
+    with pytest.raises(InputError, match="the range of site 75, 10 to 24 MW, has nothing in common"):
+        problem.solve(bounds={75: (10.0, 24.0)})
+
+
+def test_the_solver_of_the_programmes_is_silent() -> None:
+    """What a C library prints would stand in the output of `--json`."""
+    code = "from dcvrt.planning.master import highs; highs().run()"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == ran.stderr == ""
 
 
 def test_voltages_outside_the_limits_can_be_held() -> None:

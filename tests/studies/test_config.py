@@ -9,7 +9,9 @@ import pytest
 
 from dcvrt import facility
 from dcvrt.errors import InputError
+from dcvrt.planning.security import N1
 from dcvrt.studies import checks, config
+from dcvrt.studies.setting import setting_of
 from dcvrt.studies.tables import read_profiles
 
 HERE = Path()
@@ -169,6 +171,35 @@ def test_fault_at_a_candidate_bus() -> None:
 def test_negative_capacity() -> None:
     assert complaint(changed(("# h_max_mw = [30.0, 150.0,", "h_max_mw = [30.0, -150.0,"))) == (
         "my.toml: sampling.h_max_mw[2] = -150.0: must be at least 0."
+    )
+
+
+def test_sizes_by_site() -> None:
+    text = changed(
+        ("h_max_mw = 500.0 ", "h_max_mw = [30.0, 150.0, 100.0] "),
+        ("min_size_mw = 0.0 ", "min_size_mw = [1.0] "),
+    )
+    assert complaint(text).splitlines() == [
+        "my.toml: 2 problems",
+        "  hosting.h_max_mw: 3 values for 4 sites.",
+        "  hosting.min_size_mw: 1 values for 4 sites.",
+    ]
+    right = changed(
+        ("h_max_mw = 500.0 ", "h_max_mw = [30, 150.0, 100.0, 40.0] "),
+        ("min_size_mw = 0.0 ", "min_size_mw = 5 "),
+        ("# n1_rating_factor = 1.2", "n1_rating_factor = 1.3"),
+        ('base_violations = "error"', 'base_violations = "hold"'),
+    )
+    problem = setting_of(config.load(right, "my.toml"), Path()).problem
+    assert problem.upper.tolist() == [30.0, 150.0, 100.0, 40.0]
+    assert problem.lower.tolist() == [5.0] * 4
+    assert problem.security == N1(1.3)
+    crossed = changed(
+        ("h_max_mw = 500.0 ", "h_max_mw = [30.0, 150.0, 100.0, 40.0] "),
+        ("min_size_mw = 0.0 ", "min_size_mw = 40.0 "),
+    )
+    assert complaint(crossed) == (
+        "my.toml: hosting.min_size_mw: 40 MW at site 21 exceeds its h_max_mw 30 MW."
     )
 
 
