@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from dcvrt.errors import InputError, raise_all
 from dcvrt.grid.network import Network
@@ -32,7 +33,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class BusFault:
-    """Three-phase fault at a bus that is cleared by itself; the network is the same before and after.
+    """Three-phase fault at a bus, cleared by itself or by opening a branch.
 
     Parameters
     ----------
@@ -44,6 +45,9 @@ class BusFault:
         Time from inception to clearing, s.
     x_f, r_f : float
         Reactance and resistance to ground, pu on the system base.
+    opens : (int, int), optional
+        Ends of the branch that opens when the fault is cleared, and stays open; of parallel branches the
+        first that is in service. None: the network is the same before and after.
 
     Raises
     ------
@@ -54,6 +58,8 @@ class BusFault:
     --------
     >>> BusFault(23, start=1.0, clear=0.1).cleared_at
     1.1
+    >>> BusFault(23, start=1.0, clear=0.1, opens=(23, 24)).label
+    'bus 23, 100 ms, opens 23-24'
     """
 
     bus: int
@@ -61,6 +67,7 @@ class BusFault:
     clear: float = 0.1
     x_f: float = 1e-4
     r_f: float = 0.0
+    opens: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         problems = [
@@ -98,15 +105,23 @@ class BusFault:
         """Time of clearing, s."""
         return self.start + self.clear
 
-    def stages(self, network: Network) -> tuple[Stage, ...]:
-        """The network before, in and after the fault."""
+    def stages(self, network: Network, out: frozenset[int] = frozenset()) -> tuple[Stage, ...]:
+        """The network before, in and after the fault, of which the branches `out` are open already.
+
+        Raises
+        ------
+        InputError
+            When no branch in service joins the two buses of `opens`.
+        """
         shunt = {self.bus: 1.0 / complex(self.r_f, self.x_f)}
-        return Stage(0.0), Stage(self.start, shunt), Stage(self.cleared_at)
+        opened = frozenset() if self.opens is None else frozenset({branch(network, *self.opens, out)})
+        return Stage(0.0), Stage(self.start, shunt), Stage(self.cleared_at, {}, opened)
 
     @property
     def label(self) -> str:
         """What tables call it."""
-        return f"bus {self.bus}, {1e3 * self.clear:g} ms"
+        opened = "" if self.opens is None else f", opens {self.opens[0]}-{self.opens[1]}"
+        return f"bus {self.bus}, {1e3 * self.clear:g} ms{opened}"
 
 
 @dataclass(frozen=True)
@@ -182,8 +197,8 @@ class FaultSequence:
     Parameters
     ----------
     events : tuple of BusFault or LineTrip
-        In the order of time, none starting before the one before it is cleared. A line that is opened for
-        good stays open.
+        In the order of time, none starting before the one before it is cleared. A branch that is
+        opened for good stays open.
 
     Raises
     ------
@@ -234,7 +249,7 @@ class FaultSequence:
         """The network from change to change."""
         found, out = [Stage(0.0)], frozenset[int]()
         for event in self.events:
-            _, *own = event.stages(network, out) if isinstance(event, LineTrip) else event.stages(network)
+            _, *own = event.stages(network, out)
             found += [Stage(stage.begin, stage.shunts, stage.out | out) for stage in own]
             out = found[-1].out
         return tuple(found)
@@ -267,3 +282,22 @@ def branch(network: Network, from_bus: int, to_bus: int, out: frozenset[int] = f
         f"{network.name}: no branch joins buses {from_bus} and {to_bus}. Those at either end: "
         f"{', '.join(near) or 'none; check the bus numbers'}."
     )
+
+
+def islands(network: Network, out: Sequence[int]) -> list[int]:
+    """Buses that lose their path to the slack bus when branches are open."""
+    keep = np.setdiff1d(np.arange(len(network.branches)), np.array(list(out), dtype=int))
+    incidence = network.incidence[keep]
+    _, island = connected_components(abs(incidence.T) @ abs(incidence), directed=False)
+    return [int(b) for b in network.bus[island != island[network.slack]]]
+
+
+def islanding(network: Network, stages: Sequence[Stage]) -> str:
+    """What a stage cuts off by its open branches, as a sentence; empty when nothing."""
+    for stage in stages:
+        cut = islands(network, sorted(stage.out)) if stage.out else []
+        if cut:
+            lines = ", ".join(network.branches.label(k) for k in sorted(stage.out))
+            shown = ", ".join(map(str, cut[:8])) + (", ..." if len(cut) > 8 else "")
+            return f"with {lines} open, {len(cut)} bus(es) are islanded: {shown}. Islands are not simulated."
+    return ""

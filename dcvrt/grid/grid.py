@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.dae import Dae
-from dcvrt.errors import InputError, SimulationError, did_you_mean, raise_all
+from dcvrt.errors import InputError, did_you_mean, raise_all
 from dcvrt.grid import andes, dynamics118, redispatch
 from dcvrt.grid.fault_run import FaultRun
-from dcvrt.grid.faults import BusFault, Fault
+from dcvrt.grid.faults import Fault, islanding
 from dcvrt.grid.native.engine import Engine, sample_times, thetas
 from dcvrt.grid.native.steady import Flow, loads
 from dcvrt.grid.network import Network
@@ -171,7 +171,6 @@ class Grid:
         hosting : mapping of site to MW
             Hosted capacity; a site that is left out hosts nothing.
         fault : BusFault, LineTrip or FaultSequence
-            ANDES takes bus faults only.
         until : float
             End, s.
         period : Period, optional
@@ -232,9 +231,16 @@ class Grid:
             hosting, period or Period(), faults, until, engine, step, wrt, facilities or {}, values or {}
         )
         asked.check(self)
+        cut_off = {fault: islanding(self.network, fault.stages(self.network)) for fault in faults}
+        whole = replace(asked, faults=[fault for fault, said in cut_off.items() if not said])
+        by_engine = self._by_andes(whole) if engine == "andes" else self._by_own_engine(whole)
+        simulated = {found.fault: found for found in by_engine}
         runs = {}
-        for found in self._by_andes(asked) if engine == "andes" else self._by_own_engine(asked):
-            name = f"{self.name}, {asked.period.name}, fault at {found.fault.label}"
+        for fault, said in cut_off.items():
+            found = simulated.get(fault) or _Found(
+                fault, np.zeros(0), np.zeros((0, 0), dtype=complex), {}, said, ()
+            )
+            name = f"{self.name}, {asked.period.name}, fault at {fault.label}"
             reached = () if found.status else enumerate(self.sites)
             waveforms = {
                 bus: Waveform.from_samples(
@@ -248,27 +254,22 @@ class Grid:
             ended = found.status or "completed."
             if found.notes:
                 ended += f" Counts as on its limit at the start: {'; '.join(found.notes)}."
-            runs[found.fault] = FaultRun(found.fault, waveforms, f"{name}: {ended}")
+            runs[fault] = FaultRun(fault, waveforms, f"{name}: {ended}")
         return runs
 
     def _by_andes(self, asked: Request) -> Iterator[_Found]:
-        bolted = [fault for fault in dict.fromkeys(asked.faults) if isinstance(fault, BusFault)]
-        point = self.operating_point(asked.hosting, asked.period, bolted)
-        for fault in bolted:
-            times = sample_times(fault.stages(self.network), asked.until, asked.step)
+        point = self.operating_point(asked.hosting, asked.period, asked.faults)
+        for fault in asked.faults:
+            times = sample_times(point.faults[fault], asked.until, asked.step)
             v, status = point.simulate(fault, times, self.sites)
             yield _Found(fault, np.concatenate(times), v, {}, status, point.notes)
 
     def _by_own_engine(self, asked: Request) -> Iterator[_Found]:
         by = thetas(asked.wrt, self.sites, self.network)
         point = self.native.point(asked.hosting, asked.period, by, asked.facilities, asked.values)
-        for fault in dict.fromkeys(asked.faults):
+        for fault in asked.faults:
             times = sample_times(fault.stages(self.network), asked.until, asked.step)
-            try:
-                run = self.native.simulate(point, fault, times, by)
-            except SimulationError as error:  # islands: this fault has no result, the others may have
-                yield _Found(fault, np.zeros(0), np.zeros((0, 0), dtype=complex), {}, str(error), ())
-                continue
+            run = self.native.simulate(point, fault, times, by)
             tangents = {q.name: run.tangents[:, k] for k, q in enumerate(by)}
             yield _Found(fault, np.concatenate(times), run.v, tangents, run.status, point.notes)
 
@@ -309,7 +310,7 @@ class Grid:
         return dynamics118.machines(self.network) if self.rule else ()
 
     def operating_point(
-        self, hosting: Mapping[int, float], period: Period | None = None, faults: Sequence[BusFault] = ()
+        self, hosting: Mapping[int, float], period: Period | None = None, faults: Sequence[Fault] = ()
     ) -> OperatingPoint:
         """Solve power flow and initialise all machines; the arguments are those of `waveforms_of`."""
         period = period or Period()
@@ -324,7 +325,7 @@ class Grid:
             hosted,
             period.wind,
             period.load_scale,
-            faults,
+            {fault: fault.stages(self.network) for fault in faults},
             self.redispatch,
             where,
             self._set_points(hosted, period, where) if self.reactive_limits else {},

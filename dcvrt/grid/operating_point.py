@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import redispatch
 from dcvrt.grid.andes import NO_MACHINES, Said, quiet
-from dcvrt.grid.faults import BusFault
+from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import ON_LIMIT
 from dcvrt.grid.trapezoid import NoConvergenceError, Stepper
 
@@ -42,7 +42,7 @@ class OperatingPoint:
     hosted : mapping of bus to complex MVA, import positive
     wind : mapping of bus to MW
     load_scale : float
-    faults : sequence of BusFault
+    faults : mapping of fault to its stages
         Those that `simulate` will be asked for.
     rule : str
         How the units share the change of load, one of `redispatch.RULES`.
@@ -65,12 +65,12 @@ class OperatingPoint:
         hosted: Mapping[int, complex],
         wind: Mapping[int, float],
         load_scale: float,
-        faults: Sequence[BusFault],
+        faults: Mapping[Fault, Sequence[Stage]],
         rule: str,
         where: str,
         set_points: Mapping[int, float] | None = None,
     ) -> None:
-        self.system, self.where = system, where
+        self.system, self.where, self.faults = system, where, faults
         base = float(system.config.mva)
         volts = dict(zip(system.Bus.idx.v, system.Bus.Vn.v, strict=True))
         loads = int(system.PQ.n)
@@ -78,14 +78,14 @@ class OperatingPoint:
             power = (complex(hosted.get(bus, 0.0)) - wind.get(bus, 0.0)) / base
             name = f"dcvrt load {bus}"
             system.add("PQ", {"idx": name, "bus": bus, "Vn": volts[bus], "p0": power.real, "q0": power.imag})
-        self.fault_index = {fault: f"dcvrt fault {k}" for k, fault in enumerate(dict.fromkeys(faults))}
-        for fault, idx in self.fault_index.items():
-            system.add(
-                "Fault",
-                {"idx": idx, "bus": fault.bus, "tf": -1.0, "tc": -1.0, "xf": fault.x_f, "rf": fault.r_f},
-            )
+        shunts = {item for stages in faults.values() for stage in stages for item in stage.shunts.items()}
+        self.fault_index = {item: f"dcvrt fault {k}" for k, item in enumerate(sorted(shunts, key=str))}
+        for (bus, admittance), idx in self.fault_index.items():
+            z = 1.0 / admittance
+            system.add("Fault", {"idx": idx, "bus": bus, "tf": -1.0, "tc": -1.0, "xf": z.imag, "rf": z.real})
         with quiet() as said:
             system.setup()
+            self.lines = [system.Line.idx.v[k] for k in np.flatnonzero(system.Line.u.v)]
             if not system.SynGen.n:
                 raise InputError(NO_MACHINES.format(where=where))
             reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
@@ -251,15 +251,16 @@ class OperatingPoint:
 
     # -- faults --------------------------------------------------------------------------------------------
 
-    def simulate(self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
-        """Voltages at `buses` on the times of the three stretches before, in and after the fault.
+    def simulate(self, fault: Fault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
+        """Voltages at `buses` on the times of the stretches between the changes of the network.
 
         Parameters
         ----------
-        fault : BusFault
+        fault : BusFault, LineTrip or FaultSequence
             One of those the operating point was made for.
-        times : three arrays
-            The first ends where the second begins, and so on; both sides of a jump are returned.
+        times : sequence of arrays
+            One for each stage of the fault. The first ends where the second begins, and so on; both sides of
+            a jump are returned.
 
         Returns
         -------
@@ -269,17 +270,28 @@ class OperatingPoint:
             Empty when the end was reached, else the sentence that says what happened.
         """
         with quiet():
-            return self._simulate(fault, times, buses)
+            try:
+                return self._simulate(self.faults[fault], times, buses)
+            finally:
+                self._enter(Stage(0.0))
+
+    def _enter(self, stage: Stage) -> None:
+        """Put the network into a stage: its faults on, its open branches out."""
+        system = self.system
+        for item, idx in self.fault_index.items():
+            system.Fault.uf.v[system.Fault.idx2uid(idx)] = float(item in stage.shunts.items())
+        for k, idx in enumerate(self.lines):
+            if system.Line.u.v[system.Line.idx2uid(idx)] != (k not in stage.out):
+                system.set_status("Line", idx, float(k not in stage.out))
 
     def _simulate(
-        self, fault: BusFault, times: Sequence[Floats], buses: Sequence[int]
+        self, stages: Sequence[Stage], times: Sequence[Floats], buses: Sequence[int]
     ) -> tuple[Phasors, str]:
         system = self.system
         system.TDS.reinit()
-        address = [list(system.Bus.idx.v).index(bus) for bus in buses]
+        place = {bus: k for k, bus in enumerate(system.Bus.idx.v)}
+        address = [place[bus] for bus in buses]
         magnitude, angle = system.Bus.v.a[address], system.Bus.a.a[address]
-        device = system.Fault.idx2uid(self.fault_index[fault])
-        faulted = list(system.Bus.idx.v).index(fault.bus)
         samples: list[Phasors] = []
 
         def record() -> None:
@@ -289,18 +301,22 @@ class OperatingPoint:
         for _ in times[0]:  # an equilibrium, checked in `_initialise`: nothing moves before the fault
             record()
         stepper = Stepper(system)
-        stepper.t = fault.start
+        stepper.t = stages[1].begin
         rotor = _Rotors(system)
         before = system.dae.y.copy()
+        what = ""
         try:
-            for on, stretch in ((True, times[1]), (False, times[2])):
-                system.Fault.uf.v[device] = float(on)
+            for last, stage, stretch in zip(stages[:-1], stages[1:], times[1:], strict=True):
+                cleared = [bus for bus in last.shunts if bus not in stage.shunts]
+                what = "inception" if stage.shunts else "clearing" if cleared else "a change of branches"
+                self._enter(stage)
                 # In polar form V = 0 solves the balance of a bus without load, so that a search which starts
                 # from the voltages of the fault ends there: the fault would never be cleared. Start from
                 # those before it.
-                stepper.event(before)
-                if not on and system.Bus.v.v[faulted] < COLLAPSED:
-                    raise NoConvergenceError(fault.cleared_at, f"the voltage at bus {fault.bus}")
+                stepper.event(before if cleared else system.dae.y.copy())
+                for bus in cleared:
+                    if system.Bus.v.v[place[bus]] < COLLAPSED:
+                        raise NoConvergenceError(stage.begin, f"the voltage at bus {bus}")
                 record()
                 for t in stretch[1:]:
                     stepper.advance(float(t))
@@ -309,7 +325,7 @@ class OperatingPoint:
                     if lost:
                         return np.array(samples), f"lost synchronism at t = {t:.3f} s: {lost}."
         except NoConvergenceError as failure:
-            v, what = system.Bus.v.v, "inception" if system.Fault.uf.v[device] else "clearing"
+            v = system.Bus.v.v
             low = int(np.argmin(v))
             return np.array(samples), (
                 f"voltage collapse or numerical failure after {what}, at t = {failure.t:.4f} s: no "

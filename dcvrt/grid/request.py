@@ -69,11 +69,7 @@ class Request:
                 "load_model, wind_model: engine='andes' has loads and wind as impedances. Way out: "
                 "engine='native'."
             )
-        return problems + [
-            f"fault {fault.label}: engine='andes' takes bus faults only. Way out: engine='native'."
-            for fault in dict.fromkeys(self.faults)
-            if not isinstance(fault, BusFault)
-        ]
+        return problems
 
     def _of_native(self, grid: Grid) -> list[str]:
         return _problems(grid, thetas, self.wrt, grid.sites, grid.network)
@@ -125,6 +121,8 @@ class Request:
         if isinstance(event, LineTrip):
             return _problems(grid, branch, grid.network, event.from_bus, event.to_bus)
         problems = [f"fault: {line}" for line in grid.unknown([event.bus])]
+        if event.opens is not None:
+            problems += _problems(grid, branch, grid.network, *event.opens)
         if event.bus in grid.sites:
             problems.append(
                 f"fault at bus {event.bus}: it is a candidate site, and no site rides through a fault at "

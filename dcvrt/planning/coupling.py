@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from dcvrt.criteria import Criteria, Margins
 from dcvrt.errors import InfeasibleError, SimulationError
-from dcvrt.grid.faults import BusFault
 from dcvrt.grid.grid import STEP, Grid
 from dcvrt.grid.period import Period
 from dcvrt.integrators.simulator import Simulator
@@ -165,12 +164,7 @@ def _asked_of(request: Mapping[str, Any]) -> tuple[Period, dict[int, float], dic
 
 
 def _labels(request: Mapping[str, Any]) -> dict[Fault, str]:
-    return {
-        BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): (
-            replay.fault_label(f)
-        )
-        for f in request["faults"]
-    }
+    return {replay.fault_of(f): replay.fault_label(f) for f in request["faults"]}
 
 
 Asked = tuple[Mapping[int, float], Period, Sequence["Fault"], float, float]

@@ -24,7 +24,7 @@ from dcvrt.errors import InfeasibleError, SimulationError
 
 if TYPE_CHECKING:
     from dcvrt.criteria import Criteria
-    from dcvrt.grid import Grid, Period
+    from dcvrt.grid import BusFault, Grid, Period
     from dcvrt.integrators import Simulator
     from dcvrt.trajectory import Trajectory
     from dcvrt.waveform import Waveform
@@ -130,9 +130,23 @@ def lost_rows(
     ]
 
 
+def fault_of(fault: Mapping[str, Any]) -> BusFault:
+    """The fault that an entry of a request describes."""
+    from dcvrt.grid import BusFault
+
+    opens = fault.get("opens")
+    return BusFault(
+        fault["bus"],
+        start=fault["t_start_s"],
+        clear=1e-3 * fault["t_clear_ms"],
+        x_f=fault["x_pu"],
+        opens=None if opens is None else (opens[0], opens[1]),
+    )
+
+
 def fault_label(fault: Mapping[str, Any]) -> str:
     """What tables call a fault of a request."""
-    return f"bus {fault['bus']}, {fault['t_clear_ms']:g} ms"
+    return fault_of(fault).label
 
 
 def prepare(request: Mapping[str, Any]) -> str:
@@ -199,12 +213,7 @@ def period_of(request: Mapping[str, Any]) -> Period:
 
 def fault_runs(request: Mapping[str, Any]) -> list[tuple[str, Mapping[int, Waveform] | None, str]]:
     """Label, waveforms by site (None when there are none) and status of every fault of a request."""
-    from dcvrt.grid import BusFault
-
-    labels = {
-        BusFault(f["bus"], start=f["t_start_s"], clear=1e-3 * f["t_clear_ms"], x_f=f["x_pu"]): fault_label(f)
-        for f in request["faults"]
-    }
+    labels = {fault_of(f): fault_label(f) for f in request["faults"]}
     try:
         found = _grid_of(request).waveforms_of(
             hosting_of(request),

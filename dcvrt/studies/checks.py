@@ -14,8 +14,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dcvrt.errors import DcvrtError, did_you_mean, outside, raise_all
-from dcvrt.planning.replay import fault_label
+from dcvrt.errors import DcvrtError, InputError, did_you_mean, outside, raise_all
+from dcvrt.grid.faults import islanding
+from dcvrt.planning.replay import fault_label, fault_of
 from dcvrt.studies.config import (
     CriteriaSection,
     FacilitySection,
@@ -59,7 +60,7 @@ def check(text: str, where: str, folder: Path) -> StudyFile:
     network, found = read_network(sections.get("grid"), folder)
     problems += found
     if network is not None:
-        problems += unknown_buses(sections, network)
+        problems += unknown_buses(sections, network) + wrong_branches(sections, network)
     hosting = sections.get("hosting")
     year = None
     if hosting is not None:
@@ -267,6 +268,21 @@ def unknown_buses(sections: Mapping[str, Any], network: Network) -> list[str]:
         for path, bus in named
         if bus not in known
     ]
+
+
+def wrong_branches(sections: Mapping[str, Any], network: Network) -> list[str]:
+    """Branches that are to clear a fault and are not there, or whose opening cuts buses off."""
+    problems = []
+    for k, fault in enumerate(sections.get("fault", ()), start=1):
+        if fault.opens is None:
+            continue
+        try:
+            cut_off = islanding(network, fault_of(fault.model_dump()).stages(network))
+        except InputError as error:
+            cut_off = str(error).removeprefix(f"{network.name}: ")
+        if cut_off:
+            problems.append(f"fault[{k}].opens = {fault.opens}: {cut_off}")
+    return problems
 
 
 def unknown_hours(sections: Mapping[str, Any], year: Year, network: Network | None) -> list[str]:

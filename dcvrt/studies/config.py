@@ -99,12 +99,18 @@ class HostingSection(Section):
 
 
 class FaultEntry(Section):
-    """`[[fault]]`: a three-phase fault at a bus, cleared by itself."""
+    """`[[fault]]`: a three-phase fault at a bus, cleared by itself or by opening a branch."""
 
     bus: int = Field(description="bus at fault; not a candidate bus")
     t_start_s: Positive = Field(default=0.2, description="inception; the simulation begins before it")
     t_clear_ms: Positive = Field(default=100.0, description="time from inception to clearing")
     x_pu: Positive = Field(default=1e-4, description="fault reactance on the system base")
+    opens: list[int] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=2,
+        description="ends of the branch that opens with clearing and stays open; default: none does",
+    )
 
 
 class PeriodEntry(Section):

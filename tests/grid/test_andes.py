@@ -17,8 +17,9 @@ import pytest
 import scipy.sparse as sp
 
 from dcvrt.errors import InputError, SimulationError
-from dcvrt.grid import BusFault, Grid, LineTrip, Period
+from dcvrt.grid import BusFault, FaultSequence, Grid, LineTrip, Period
 from dcvrt.grid.andes import quiet
+from dcvrt.grid.faults import Fault
 from dcvrt.grid.operating_point import OperatingPoint
 from dcvrt.grid.screening import retained_voltage
 from dcvrt.grid.trapezoid import Stepper
@@ -151,12 +152,42 @@ def test_what_andes_does_not_give(grid: Grid, arguments: dict[str, object], mess
     assert str(failure.value) == message
 
 
-def test_andes_takes_bus_faults_only(grid: Grid) -> None:
-    with pytest.raises(InputError) as failure:
-        grid.waveforms(NO_VRT, LineTrip(23, 24), engine="andes")
-    assert str(failure.value) == (
-        "ieee118: fault line 23-24: engine='andes' takes bus faults only. Way out: engine='native'."
-    )
+@pytest.mark.parametrize(
+    "fault",
+    [
+        BusFault(77, opens=(77, 80)),
+        BusFault(23, clear=0.15, opens=(24, 23)),
+        LineTrip(77, 80, reclose=0.3),
+        FaultSequence((BusFault(77, opens=(77, 80)), BusFault(77, 0.5, 0.1, opens=(77, 78)))),
+    ],
+    ids=lambda fault: fault.label,
+)
+def test_branches_open_alike_in_both_engines(grid: Grid, fault: Fault) -> None:
+    """The difference is the step error of the trapezoidal rule, of order 2, on both sides of every jump."""
+
+    def difference(step: float) -> float:
+        own = grid.waveforms(NO_VRT, fault, until=1.0, step=step)
+        by_andes = grid.waveforms(NO_VRT, fault, until=1.0, step=step, engine="andes")
+        return max(float(np.abs(np.abs(own[bus].v) - np.abs(by_andes[bus].v)).max()) for bus in SITES)
+
+    coarse, fine = difference(1 / 120), difference(1 / 240)
+    assert fine < 1e-4
+    assert 3.5 < coarse / fine < 4.5
+
+
+def test_a_branch_that_opens_leaves_the_operating_point_as_it_was(grid: Grid) -> None:
+    plain, opening = BusFault(77), BusFault(77, opens=(77, 80))
+    both = grid.waveforms_of(NO_VRT, None, [opening, plain], until=0.5, engine="andes")
+    alone = grid.waveforms(NO_VRT, plain, until=0.5, engine="andes")
+    np.testing.assert_allclose(both[plain].waveforms[75].v, alone[75].v, atol=1e-9)
+    assert np.abs(both[opening].waveforms[75].v - alone[75].v).max() > 0.01
+
+
+def test_andes_is_not_asked_for_islands(grid: Grid) -> None:
+    runs = grid.waveforms_of(NO_VRT, None, [LineTrip(9, 10), BusFault(77)], until=0.3, engine="andes")
+    island, fine = runs.values()
+    assert "with 9-10 open, 1 bus(es) are islanded: 10. Islands are not simulated." in island.status
+    assert fine.completed
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dcvrt.planning.replay import facility_rows, fault_label, lost_rows, modes_passed
+from dcvrt.planning.replay import facility_rows, fault_label, fault_of, lost_rows, modes_passed
 from dcvrt.planning.verdict import verdict
 
 REQUEST = {
@@ -14,7 +14,10 @@ REQUEST = {
     "hosting": [30.0, 0.0],
     "period": {"name": "peak"},
     "runs": [["gfl", 1.2]],
-    "faults": [{"bus": 32, "t_clear_ms": 100.0}, {"bus": 34, "t_clear_ms": 83.3}],
+    "faults": [
+        {"bus": 32, "t_start_s": 0.2, "t_clear_ms": 100.0, "x_pu": 1e-4},
+        {"bus": 34, "t_start_s": 0.2, "t_clear_ms": 83.3, "x_pu": 1e-4},
+    ],
     "gradients": False,
 }
 H = {21: 30.0, 75: 0.0}
@@ -100,12 +103,14 @@ def test_lost_runs_are_rows_that_are_not_ok() -> None:
     assert all(math.isnan(r["v_margin_pu"]) and math.isnan(r["loss_margin_mw"]) for r in rows)
 
 
-def test_labels_of_faults_are_those_of_the_grid() -> None:
+def test_faults_of_a_request_are_those_of_the_grid() -> None:
     from dcvrt.grid import BusFault
 
-    assert (
-        fault_label({"bus": 32, "t_clear_ms": 83.3}) == BusFault(32, clear=0.0833).label == "bus 32, 83.3 ms"
-    )
+    entry = {"bus": 32, "t_start_s": 0.2, "t_clear_ms": 83.3, "x_pu": 1e-3}
+    fault = fault_of(entry | {"opens": [32, 113]})
+    assert (fault.bus, fault.start, fault.x_f, fault.opens) == (32, 0.2, 1e-3, (32, 113))
+    assert fault.clear == pytest.approx(0.0833)
+    assert fault_label(entry) == BusFault(32, clear=0.0833).label == "bus 32, 83.3 ms"
 
 
 def test_modes_are_read_from_a_real_run() -> None:

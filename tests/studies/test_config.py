@@ -9,6 +9,7 @@ import pytest
 
 from dcvrt import facility
 from dcvrt.errors import InputError
+from dcvrt.planning import replay
 from dcvrt.planning.security import N1
 from dcvrt.studies import checks, config
 from dcvrt.studies.setting import setting_of
@@ -165,6 +166,20 @@ def test_fault_at_a_candidate_bus() -> None:
         "my.toml: fault[1].bus = 75: is a candidate bus; a site cannot ride through a fault at its own "
         "terminals. "
         "Way out: take a neighbouring bus, or drop it from grid.sites."
+    )
+
+
+def test_a_branch_that_clears_a_fault() -> None:
+    given = "# opens = [25, 27]          # the branch"
+    file = checks.check(changed((given, "opens = [25, 27] # the branch")), "my.toml", HERE)
+    assert replay.fault_label(file.fault[0].model_dump()) == "bus 25, 100 ms, opens 25-27"
+    assert complaint(changed((given, "opens = [25, 28] # the branch"))) == (
+        "my.toml: fault[1].opens = [25, 28]: no branch joins buses 25 and 28. Those at either end: 23-25, "
+        "26-25, 25-27, 27-28, 28-29."
+    )
+    assert complaint(changed((given, "opens = [9, 10] # the branch"))) == (
+        "my.toml: fault[1].opens = [9, 10]: with 9-10 open, 1 bus(es) are islanded: 10. Islands are not "
+        "simulated."
     )
 
 

@@ -17,7 +17,7 @@ from dcvrt.errors import InputError, did_you_mean, raise_all
 from dcvrt.grid import units as described
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import Group, Unit
-from dcvrt.grid.native.point import NativePoint, System, refuse_islands
+from dcvrt.grid.native.point import NativePoint, System
 from dcvrt.grid.native.run import MOST_DIRECTIONS, Options, Simulated
 from dcvrt.grid.native.steady import Flow, directions, loads
 from dcvrt.grid.native.structure import SCALE, Structure
@@ -285,7 +285,6 @@ class Engine:
     ) -> Simulated:
         """One fault from a point; `wrt` as the point was made with."""
         stages = fault.stages(self.network)
-        refuse_islands(self.network, stages, f"{point.where}, fault at {fault.label}")
         clear = np.array([float(q.kind == "clear") for q in wrt])
         last = len(stages) - 1
         return point.simulate(stages, times, self.options, {last: clear} if clear.any() else None)

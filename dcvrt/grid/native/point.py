@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from dcvrt.errors import SimulationError
 from dcvrt.grid.faults import Stage
@@ -324,24 +323,3 @@ class NativePoint:
             found.rejected,
             found.end,
         )
-
-
-def islands(network: Network, out: Sequence[int]) -> list[int]:
-    """Buses that lose their path to the slack bus when branches are open."""
-    keep = np.setdiff1d(np.arange(len(network.branches)), np.array(list(out), dtype=int))
-    incidence = network.incidence[keep]
-    _, island = connected_components(abs(incidence.T) @ abs(incidence), directed=False)
-    return [int(b) for b in network.bus[island != island[network.slack]]]
-
-
-def refuse_islands(network: Network, stages: Sequence[Stage], where: str) -> None:
-    """Raise `SimulationError` when a stage cuts buses off."""
-    for stage in stages:
-        cut = islands(network, sorted(stage.out)) if stage.out else []
-        if cut:
-            lines = ", ".join(network.branches.label(k) for k in sorted(stage.out))
-            shown = ", ".join(map(str, cut[:8])) + (", ..." if len(cut) > 8 else "")
-            raise SimulationError(
-                f"{where}: with {lines} open, {len(cut)} bus(es) are islanded: {shown}. Islands are "
-                "not simulated."
-            )

@@ -29,7 +29,7 @@ def grid(findings: Findings) -> Safe:
         why = [str(site) for site in findings.sites if hardest[site] == name]
         fault_rows.append(
             [
-                f"bus {fault.bus}",
+                f"bus {fault.bus}" + (f", opens {fault.opens[0]}-{fault.opens[1]}" if fault.opens else ""),
                 f"{fault.t_clear_ms:g}",
                 f"{fault.x_pu:g}",
                 *cells,
@@ -50,7 +50,8 @@ def grid(findings: Findings) -> Safe:
         paragraph(
             f"Network: {findings.study.grid.case}. Candidate sites: bus "
             f"{', '.join(map(str, findings.sites))}. Faults are three-phase, at buses without a data "
-            f"centre, and clear by themselves; simulated with {findings.study.grid.engine}."
+            f"centre, and clear by themselves or with the branch that opens; simulated with "
+            f"{findings.study.grid.engine}."
         )
     ]
     picture = findings.folder / "figures" / "network_map.svg"
