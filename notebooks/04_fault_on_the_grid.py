@@ -74,11 +74,14 @@ assert abs(slope - difference) < 0.01 * abs(difference)
 # %% [markdown]
 # ## Other disturbances
 #
-# Lines may trip, and faults may come in sequence, as after an unsuccessful reclosing.
+# A fault may be cleared by opening a branch, lines may trip, and faults may come in sequence, as after an unsuccessful
+# reclosing.
 
 # %%
 reclosed = FaultSequence((BusFault(107, start=0.5, clear=0.1), BusFault(107, start=1.1, clear=0.1)))
-for name, event in {"line 105-106 trips": LineTrip(105, 106, start=0.5), "reclosing": reclosed}.items():
+opening = BusFault(107, start=0.5, clear=0.1, opens=(105, 107))
+trip = LineTrip(105, 106, start=0.5)
+for name, event in {"cleared by 105-107": opening, "line 105-106 trips": trip, "reclosing": reclosed}.items():
     lowest = {bus: float(np.abs(w.v).min()) for bus, w in grid.waveforms(hosting, event, until=2.0).items()}
     print(name, {bus: round(value, 3) for bus, value in lowest.items()})
 
