@@ -68,6 +68,7 @@ def _bars(axes: Axes, findings: Findings, mode: str, about: dict[str, Any]) -> N
             elif end["unseen"]:
                 axes.plot(0.0, y, "x", markersize=5, color=FAILED)
     axes.axvline(0.0, color=GREY, linewidth=1.0)
+    axes.use_sticky_edges = False  # else bars to one side only leave 0 at the very edge
     axes.margins(x=0.08)
     axes.set_yticks(range(len(rows)), [label(row) for row in rows], parse_math=False)
     axes.set_ylim(len(rows) - 0.4, -0.6)

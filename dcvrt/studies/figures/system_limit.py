@@ -49,6 +49,8 @@ def curve(rows: Sequence[dict[str, Any]]) -> tuple[list[float], list[float]]:
 def draw(findings: Findings) -> Figure | None:
     """Curves of all modes and ratings; plans that failed the replay are crossed out.
 
+    Steps, not straight lines, since between two plans only the smaller one is known to keep to the limit.
+
     Open symbols are plans of the frontier, whose every site rides through, at what they lose at once. None
     when no limit was tried.
     """
@@ -84,7 +86,7 @@ def _curves(axes: Axes, findings: Findings, mode: str) -> None:
         marker = MARKERS[k % len(MARKERS)]
         rows = [row for row in found["rows"] if (row["mode"], row["beta"]) == (mode, beta)]
         loss, total = curve(rows)
-        axes.plot(loss, total, color=colour, marker=marker, label=f"β = {beta:g}", zorder=3)
+        axes.step(loss, total, where="post", color=colour, marker=marker, label=f"β = {beta:g}", zorder=3)
         widest = max([row["limit_mw"] for row in rows if row["passed"]], default=0.0)
         if loss and widest > loss[-1]:  # the network decides: as much up to the largest limit
             axes.plot([loss[-1], min(widest, axes.get_xlim()[1])], [total[-1]] * 2, color=colour, zorder=2.5)
