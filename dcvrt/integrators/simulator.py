@@ -291,11 +291,16 @@ class Simulator:
             X = np.zeros((len(P), kernel.width))
             Z = np.zeros((len(P), kernel.equations.nz * (1 + kernel.equations.nw)))
             missing = list(range(len(P)))
+        without: dict[bytes, str] = {}  # faults of one operating point begin alike, and such a search is long
         for k in missing:
-            try:
-                X[k], Z[k] = self._begin(kernel.equations, tables[k], P[k])
-            except SimulationError as error:
-                failures[k] = str(error)
+            at = tables[k].first.tobytes() + P[k].tobytes()
+            if at not in without:
+                try:
+                    X[k], Z[k] = self._begin(kernel.equations, tables[k], P[k])
+                    continue
+                except SimulationError as error:
+                    without[at] = str(error)
+            failures[k] = without[at]
         return X, Z, failures
 
     def _attempt_adjoint(
