@@ -94,7 +94,7 @@ def exact_of(
                 continue
             loss[k] = row["loss_share"]
             value[k] = [row[column] for column in COLUMNS]
-            gradients = row["gradients"]
+            gradients = row.get("gradients")
             if gradients:
                 for t, target in enumerate(TARGETS):
                     by_beta[k, t] = gradients[target]["beta"]

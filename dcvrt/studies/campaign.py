@@ -70,6 +70,9 @@ class Crew(Protocol):
     ) -> Iterator[tuple[Task, Outcome]]:
         """Do every task; `started` is called before each start and returns the number of starts so far."""
 
+    def ahead(self, tasks: Sequence[Task], function: TaskFunction) -> None:
+        """Name tasks that will be asked for later, so that who is idle may do them before."""
+
 
 Progress = Callable[[str, int, int, int], None]
 """Called with phase, tasks ended, tasks in all, tasks without a result."""
@@ -161,6 +164,14 @@ class Campaign:
             if key in lost
         ]
 
+    def ahead(self, phase: str, tasks: Sequence[Task], function: TaskFunction) -> None:
+        """Let workers that are idle do tasks that `run` will be called with later; nothing is written before.
+
+        A task that was started before and has not ended waits for its phase.
+        """
+        states = self.store.task_states(phase)
+        self.crew.ahead([t for t in tasks if states.get(t.key, ("open", 0)) == ("open", 0)], function)
+
     def _set_aside(
         self, task: Task, state: str, message: str, seconds: float, record_lost: Callable[[Task, str], None]
     ) -> None:
@@ -211,7 +222,10 @@ def attempt(function: TaskFunction, payload: Payload) -> Outcome:
 
 
 class InProcess:
-    """Does the tasks one after the other in this process."""
+    """Does the tasks one after the other in this process, and none ahead of its time."""
+
+    def ahead(self, tasks: Sequence[Task], function: TaskFunction) -> None:
+        """See `Crew`."""
 
     def run(
         self,

@@ -3,6 +3,9 @@
 As many tasks are handed out as there are workers, no more: so the time of a task counts from when it is
 handed out, and a dying worker takes one task with it. A task whose worker died is done again alone, with
 nothing else running beside it, so that no task is blamed for another's death.
+
+Tasks that a later phase will ask for may be named ahead. A worker that has nothing else to do takes them up,
+one place always left to this process, which searches meanwhile.
 """
 
 from __future__ import annotations
@@ -10,10 +13,11 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from dcvrt.errors import InputError
@@ -40,6 +44,10 @@ class Cluster:
         self.workers, self.scheduler = workers, scheduler
         self._client: Any = None
         self._cluster: Any = None
+        self._lock = threading.Lock()
+        self._later: dict[str, tuple[Task, TaskFunction]] = {}
+        self._early: dict[str, tuple[Any, float]] = {}
+        self._taken = 1
 
     def __enter__(self) -> Cluster:
         import dask
@@ -90,6 +98,7 @@ class Cluster:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._later.clear()
         with _interrupts_held_back():  # a second Ctrl-C must not leave workers behind
             if self._client is not None:
                 self._client.close()
@@ -107,19 +116,30 @@ class Cluster:
         started: Callable[[Task], int],
     ) -> Iterator[tuple[Task, Outcome]]:
         """See `dcvrt.studies.campaign.Crew`."""
-        waiting, suspects = deque(tasks), deque[Task]()
+        waiting, suspects = deque[Task](), deque[Task]()
         running: dict[Any, tuple[Task, float, int]] = {}
+        for task in tasks:
+            with self._lock:
+                self._later.pop(task.key, None)
+                early = self._early.pop(task.key, None)
+            if early is None:
+                waiting.append(task)
+            else:
+                running[early[0]] = (task, early[1], started(task))
         alone = False
         while waiting or suspects or running:
             if not running:
                 alone = not waiting
             source = suspects if alone else waiting
-            while source and len(running) < (1 if alone else self._places()):
+            self._taken = self._places()  # none is left for tasks of later phases while some of this one wait
+            if alone:
+                self._let_end(timeout_s)
+            while source and len(running) < (1 if alone else max(1, self._places() - self._under_way())):
                 task = source.popleft()
-                future = self._client.submit(
-                    attempt, function, dict(task.payload), key=f"{task.key}-{time.time_ns()}", pure=False
-                )
+                future = self._submit(task, function)
                 running[future] = (task, time.monotonic(), started(task))
+            if not source and not alone:
+                self._take_up(len(running))
             for future in self._ended(running, timeout_s):
                 task, begin, starts = running.pop(future)
                 outcome = self._outcome(future, timeout_s, time.monotonic() - begin, starts)
@@ -127,6 +147,40 @@ class Cluster:
                     suspects.append(task)
                 else:
                     yield task, outcome
+        self._take_up(1)
+
+    def ahead(self, tasks: Sequence[Task], function: TaskFunction) -> None:
+        """See `Crew`."""
+        with self._lock:
+            self._later |= {task.key: (task, function) for task in tasks if task.key not in self._early}
+        self._take_up(1)
+
+    def _take_up(self, taken: int | None = None) -> None:
+        """Hand out tasks of later phases while places are free beside those that are `taken`."""
+        with self._lock:
+            self._taken = self._taken if taken is None else taken
+            while self._later and self._under_way() + self._taken < self._places():
+                key = next(iter(self._later))
+                task, function = self._later.pop(key)
+                future = self._submit(task, function)
+                self._early[key] = (future, time.monotonic())
+                future.add_done_callback(lambda _: self._take_up())
+
+    def _under_way(self) -> int:
+        """Tasks of later phases that workers are doing."""
+        return sum(not future.done() for future, _ in list(self._early.values()))
+
+    def _let_end(self, timeout_s: float) -> None:
+        """Wait for the tasks of later phases that workers are doing."""
+        from distributed import wait
+
+        with suppress(TimeoutError):
+            wait([future for future, _ in self._early.values()], timeout=timeout_s)
+
+    def _submit(self, task: Task, function: TaskFunction) -> Any:
+        return self._client.submit(
+            attempt, function, dict(task.payload), key=f"{task.key}-{time.time_ns()}", pure=False
+        )
 
     def _places(self) -> int:
         """Tasks that can run at once. A worker that is being replaced keeps its place."""

@@ -89,7 +89,7 @@ def fault_runs(store: Store, margins: pd.DataFrame) -> pd.DataFrame:
 
 
 def _simulations(store: Store) -> dict[str, dict[str, int]]:
-    margins = store.margins()
+    margins = store.margins(gradients=False)
     role = dict(zip(store.hostings().name, store.hostings().role, strict=True))
     margins = margins.assign(kind=[KINDS[role[name]] for name in margins.hosting])
     spent = {}

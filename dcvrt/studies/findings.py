@@ -78,9 +78,9 @@ class Findings:
 
     @cached_property
     def margins(self) -> pd.DataFrame:
-        """Every checked facility run, of samples and plans."""
+        """Every checked facility run, of samples and plans, without its gradients."""
         with self._store() as store:
-            return store.margins()
+            return store.margins(gradients=False)
 
     @cached_property
     def hostings(self) -> pd.DataFrame:
@@ -243,10 +243,16 @@ class Findings:
         """The compiled facility of a mode, with the parameters that the study sets."""
         from dcvrt import facility
 
-        diagram = facility.get(mode)
-        for path, value in self.parameters(mode).items():
-            diagram.set(path, value, "study file")
-        return diagram.compile()
+        if mode not in self._facilities:
+            diagram = facility.get(mode)
+            for path, value in self.parameters(mode).items():
+                diagram.set(path, value, "study file")
+            self._facilities[mode] = diagram.compile()
+        return self._facilities[mode]
+
+    @cached_property
+    def _facilities(self) -> dict[str, Dae]:
+        return {}
 
     def parameters(self, mode: str) -> dict[str, float]:
         """Parameters that the study sets for a mode, by path."""

@@ -75,6 +75,9 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
         store.clear("system_plans")
         store.put("system_plans", limited)
         store.note(frontier_from=_state(store, setting))
+    # All of them were replayed in the search; sensitivities may begin while other methods make their plans.
+    found_plans = [plan for plan in records(store.plans()) if plan["method"] == METHOD]
+    simulations.write_verdicts(store, setting, found_plans)
     return asked.lost
 
 

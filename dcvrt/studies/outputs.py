@@ -193,7 +193,7 @@ def simulations(store: Store) -> dict[str, int]:
 
     A fault without a waveform is one failure, however many facility runs it would have fed.
     """
-    margins, tasks = store.margins(), store.tasks()
+    margins, tasks = store.margins(gradients=False), store.tasks()
     faults = fault_runs(store, margins[margins.failed_in != "task"])
     ran = margins[margins.failed_in.isin(["", *RUN_FAILED])]
     return {

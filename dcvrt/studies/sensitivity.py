@@ -65,13 +65,8 @@ def run_sensitivity(campaign: Campaign, setting: Setting, progress: Any) -> list
     Nothing is done when the plans, the study and what is asked are those of the rows that are there, and none
     are found where searches are in closed loop: the voltages then depend on what is varied.
     """
-    file, store = setting.file, campaign.store
-    modes = [] if setting.closed else file.facility.modes
-    plans = {mode: plan for mode in modes if (plan := headline(store, file, mode)) is not None}
-    study = {"study": file.model_dump(mode="json"), "folder": str(setting.folder.resolve())}
-    tasks = [Task(PHASE, study | {"mode": mode, "plan": _needed(plan)}) for mode, plan in plans.items()]
-    digest = hashlib.sha256("".join(task.key for task in tasks).encode()).hexdigest()
-    if store.provenance().get("sensitivities_from") == digest:
+    store, tasks = campaign.store, _tasks(campaign.store, setting)
+    if _known(store, tasks):
         return []
     answers: dict[str, dict[str, Any]] = {}
     lost: list[str] = []
@@ -89,16 +84,41 @@ def run_sensitivity(campaign: Campaign, setting: Setting, progress: Any) -> list
         else:
             lost.append(f"{PHASE} of {mode}: {outcome.state}: {outcome.message}")
         progress(PHASE, number, len(tasks), len(lost))
-    found = [answers[mode] for mode in plans if mode in answers]
+    found = [answers[task.payload["mode"]] for task in tasks if task.payload["mode"] in answers]
     with store.transaction():
         store.clear(PHASE)
         store.put(PHASE, [row for answer in found for row in answer["rows"]])
         store.note(
-            sensitivities_from="" if lost else digest,
+            sensitivities_from="" if lost else _digest(tasks),
             sensitivity_plans={answer["mode"]: answer["plan"] for answer in found},
             sensitivity_runs={kind: sum(answer[kind] for answer in found) for kind in ("grid", "facility")},
         )
     return lost
+
+
+def sensitivity_ahead(campaign: Campaign, setting: Setting) -> None:
+    """Let idle workers find sensitivities, once the plans of the frontier are judged."""
+    tasks = _tasks(campaign.store, setting)
+    if not _known(campaign.store, tasks):
+        campaign.crew.ahead(tasks, of_plan)
+
+
+def _tasks(store: Store, setting: Setting) -> list[Task]:
+    """One task for each mode that has a plan."""
+    file = setting.file
+    modes = [] if setting.closed else file.facility.modes
+    plans = {mode: plan for mode in modes if (plan := headline(store, file, mode)) is not None}
+    study = {"study": file.model_dump(mode="json"), "folder": str(setting.folder.resolve())}
+    return [Task(PHASE, study | {"mode": mode, "plan": _needed(plan)}) for mode, plan in plans.items()]
+
+
+def _digest(tasks: Sequence[Task]) -> str:
+    return hashlib.sha256("".join(task.key for task in tasks).encode()).hexdigest()
+
+
+def _known(store: Store, tasks: Sequence[Task]) -> bool:
+    """Whether the rows that are there are the answers to these tasks."""
+    return store.provenance().get("sensitivities_from") == _digest(tasks)
 
 
 def _needed(plan: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,11 +12,13 @@ from dcvrt.planning.requirement import SystemLimit
 from dcvrt.planning.verdict import limit_verdict, verdict
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.setting import NO_VRT, REACTIVE, Setting
-from dcvrt.studies.store import records
+from dcvrt.studies.store import Store, records
 
 SAMPLES, FRONTIER, CANDIDATES, REPLAYS = "samples", "frontier", "candidates", "replays"
 """What is simulated: samples of the fits; points of the frontier's search; its candidates, by the engine of
 the replay; plans of the other methods."""
+PLAN = ["hosting", "mode", "beta"]
+"""Columns that name a plan whose runs are judged together."""
 
 
 def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
@@ -36,8 +38,13 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
             ],
         )
         store.note(sampled_box_mw=dict(zip(map(str, setting.sites), samples.upper.tolist(), strict=True)))
+    return simulate(campaign, SAMPLES, sample_jobs(setting))
+
+
+def sample_jobs(setting: Setting) -> list[Job]:
+    """What is simulated of the samples."""
     engine, gradients = setting.file.grid.engine, setting.file.sampling.gradients
-    jobs = [
+    return [
         Job(
             f"s{k:04}",
             setting.request(
@@ -45,9 +52,14 @@ def run_samples(campaign: Campaign, setting: Setting) -> list[str]:
             ),
         )
         for period in setting.periods
-        for k, H in enumerate(samples.hosting.tolist())
+        for k, H in enumerate(setting.samples().hosting.tolist())
     ]
-    return simulate(campaign, SAMPLES, jobs)
+
+
+def samples_ahead(campaign: Campaign, setting: Setting) -> None:
+    """Let idle workers simulate samples before their phase."""
+    tasks = [Task(SAMPLES, job.request) for job in sample_jobs(setting)]
+    campaign.ahead(SAMPLES, tasks, coupling.check_hosting)
 
 
 def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
@@ -61,8 +73,8 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             wanted.setdefault(plan["hosting"], (_hosted(plan, setting), set()))[1].add(
                 (plan["mode"], plan["beta"])
             )
-    keys = ["hosting", "mode", "beta"]
-    made = {tuple(key) for key in store.margins(hosting=list(wanted))[keys].itertuples(index=False)}
+    replayed = store.margins(hosting=list(wanted), gradients=False)[PLAN]
+    made = {tuple(key) for key in replayed.itertuples(index=False)}
     lost = replay_plans(
         campaign,
         setting,
@@ -73,7 +85,20 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             if (missing := sorted(run for run in runs if (name, *run) not in made))
         ],
     )
-    runs_of = {key: records(rows) for key, rows in store.margins(hosting=list(wanted)).groupby(keys)}
+    write_verdicts(store, setting, plans, limited)
+    return lost
+
+
+def write_verdicts(
+    store: Store,
+    setting: Setting,
+    plans: Sequence[Mapping[str, Any]],
+    limited: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Judge plans, and such under system limits, by their replays."""
+    names = list({plan["hosting"] for plan in [*plans, *limited]})
+    replayed = store.margins(hosting=names, gradients=False)
+    runs_of = {key: records(rows) for key, rows in replayed.groupby(PLAN)}
     places = len(setting.periods) * len(setting.file.fault)
     with store.transaction():
         for plan in plans:
@@ -82,15 +107,14 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             found = verdict(rows, by_site, sum(mw > 0 for mw in by_site.values()) * places)
             of_power_flow = {key: value for key, value in plan["worst"].items() if key == REACTIVE}
             found["worst"] = found["worst"] | of_power_flow
-            store.put("plans", [plan | found | {"replayed": 1}])
+            store.put("plans", [{**plan, **found, "replayed": 1}])
         for plan in limited:
             rows = runs_of.get((plan["hosting"], plan["mode"], plan["beta"]), [])
             limit = SystemLimit(setting.sites, setting.d, plan["limit_mw"], plan["limit_share"])
             exact = exact_of(rows, setting.sites, _hosted(plan, setting))
-            replayed = exact.get((plan["mode"], plan["beta"]), [])
-            found = limit_verdict(replayed, limit, places if plan["total_mw"] > 0 else 0)
-            store.put("system_plans", [plan | found | {"replayed": 1}])
-    return lost
+            ran = exact.get((plan["mode"], plan["beta"]), [])
+            found = limit_verdict(ran, limit, places if plan["total_mw"] > 0 else 0)
+            store.put("system_plans", [{**plan, **found, "replayed": 1}])
 
 
 def _hosted(plan: Mapping[str, Any], setting: Setting) -> list[float]:

@@ -68,7 +68,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -323,8 +323,11 @@ class Store:
         """Every hosting vector: samples and plans."""
         return self._frame("hostings", order="role DESC, name")
 
-    def margins(self, role: str | None = None, hosting: str | Sequence[str] | None = None) -> pd.DataFrame:
-        """Every checked facility run; of hosting vectors of a role only, or of one vector or some."""
+    def margins(
+        self, role: str | None = None, hosting: str | Sequence[str] | None = None, gradients: bool = True
+    ) -> pd.DataFrame:
+        """Every checked facility run; of hosting vectors of a role only, or of one vector or some. Without
+        its gradients, which take most of the time, where nobody reads them."""
         names = [hosting] if isinstance(hosting, str) else hosting
         conditions = {
             "hosting IN (SELECT name FROM hostings WHERE role = ?)": role,
@@ -336,6 +339,7 @@ class Store:
             f"WHERE {' AND '.join(given)}" if given else "",
             tuple(given.values()),
             order="hosting, period, fault, site, mode, beta",
+            leave=() if gradients else ("gradients",),
         )
 
     def surrogates(self) -> pd.DataFrame:
@@ -395,12 +399,20 @@ class Store:
         return found.splitlines()[-1]
 
     def _frame(
-        self, table: str, where: str = "", values: Sequence[Any] = (), order: str = "1"
+        self,
+        table: str,
+        where: str = "",
+        values: Sequence[Any] = (),
+        order: str = "1",
+        leave: Collection[str] = (),
     ) -> pd.DataFrame:
         import pandas as pd
 
+        columns = [row[1] for row in self._base.execute(f"PRAGMA table_info({table})")]
         frame = pd.read_sql_query(
-            f"SELECT * FROM {table} {where} ORDER BY {order}", self._base, params=list(values)
+            f"SELECT {', '.join(c for c in columns if c not in leave)} FROM {table} {where} ORDER BY {order}",
+            self._base,
+            params=list(values),
         )
         for column in JSON_COLUMNS & set(frame.columns):
             frame[column] = [json.loads(text) for text in frame[column]]

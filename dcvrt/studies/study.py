@@ -127,17 +127,18 @@ class Study:
                 try:
                     # First, so that its hosting programme has no past: cuts kept from other solves move its
                     # optimum by 1e-4 MW, and a run that is gone on with would ask for other simulations.
+                    simulations.samples_ahead(campaign, setting)
                     lost = frontier.run_frontier(campaign, setting, reporter)
+                    frontier.run_mechanisms(store, setting)
+                    sensitivity.sensitivity_ahead(campaign, setting)
                     lost += simulations.run_samples(campaign, setting)
                     surrogates = fits.run_fits(store, setting)
                     plans.run_plans(store, setting, surrogates, reporter)
                     lost += simulations.run_replays(campaign, setting)
                     lost += coupling.run_coupling(campaign, setting)
-                    frontier.run_mechanisms(store, setting)
                     lost += sensitivity.run_sensitivity(campaign, setting, reporter)
                 finally:
                     store.note(wall_s=store.provenance().get("wall_s", 0.0) + time.monotonic() - begin)
-                outputs.write_results(folder, store)
         result = Result(folder, lost)
         result.report()
         return result
@@ -297,7 +298,7 @@ def prepare(file: StudyFile, setting: Setting) -> dict[str, str]:
         runs = [(mode, beta) for beta in file.facility.beta]
         for period in setting.periods:
             zero = [0.0] * len(setting.sites)
-            if file.frontier.search:
+            if file.frontier.search or file.sampling.gradients:
                 replay.prepare(setting.request(zero, period, runs, engine=file.grid.engine, gradients=True))
             for engine in (file.grid.engine, file.replay.engine):
                 backends[mode] = replay.prepare(setting.request(zero, period, runs, engine=engine))

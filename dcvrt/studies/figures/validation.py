@@ -74,7 +74,8 @@ def fitted_points(findings: Findings, method: str, target: str) -> tuple[Floats,
     if joined.empty:
         return np.zeros(0), np.zeros(0)
     sites = [str(site) for site in findings.sites]
-    H = np.array([[hostings.by_site[name][site] for site in sites] for name in joined.hosting])
+    vector = {name: [by_site[site] for site in sites] for name, by_site in hostings.by_site.items()}
+    H = np.array([vector[name] for name in joined.hosting])
     slopes = np.array([[slope[site] for site in sites] for slope in joined.slopes])
     d = joined.period.map({name: period["dc_factor"] for name, period in findings.periods.items()}).to_numpy(
         dtype=float
