@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 AT_LIMIT = 0.99
 """Share of the current limit from which on the limiter counts as active."""
+AT_REST = 0.01
+"""Share by which the import may differ from that before the fault at the begin of a window that holds its
+fall."""
 DISCHARGING = 0.01
 """Battery power, over the import before the fault, from which on it counts as supplying the load."""
 SAME_VOLTAGE = 0.02
@@ -33,12 +36,15 @@ def mechanism(run: Trajectory, modes: Sequence[str], target: str, time: float, w
     Returns
     -------
     str
-        The first that applies, for most of the window. `supervisor`: the facility is in BATTERY or RETURN;
+        The first that applies, for most of the window; of one that begins with the fault, only from the least
+        import on, as the fall itself meets no limit yet. `supervisor`: the facility is in BATTERY or RETURN;
         `DC link`, of the voltage: the output stage is at the most that it can modulate,
         :math:`m_{max} \sqrt{w}`; `limiter`: the current is at its limit; `BESS`: the battery supplies load
         that the grid could; `control`: none of these, so the loops themselves.
     """
     inside = (run.t >= time - 1e-9) & (run.t <= time + window + 1e-9)
+    if inside.any() and run["p_g"][inside][0] >= (1.0 - AT_REST) * run["p_g"][0]:
+        inside &= run.t >= run.t[inside][run["p_g"][inside].argmin()]
     if not inside.any():
         inside = np.arange(len(run.t)) == int(abs(run.t - time).argmin())
     away = [modes[round(float(number))] in ("BATTERY", "RETURN") for number in run["mode"][inside]]

@@ -307,13 +307,22 @@ def lowest_voltage(waveform: Waveform, wrt: Sequence[str] = ()) -> tuple[float, 
 
 
 def modes_passed(sequence: Sequence[str]) -> list[str]:
-    """Modes in the order in which they were entered, from the event sequence of a run.
+    """Modes of the supervisor in the order in which they were entered, from the event sequence of a run.
+
+    What other automata enter stands between them, with the path of its block.
 
     >>> modes_passed(("sup: NORMAL", "sup: NORMAL -> MIXED [v_f < V_dip]", "sup: MIXED -> NORMAL [calm]"))
     ['NORMAL', 'MIXED', 'NORMAL']
+    >>> modes_passed(("sup: NORMAL", "cooling: RUN", "cooling: RUN -> OUT [v < V_drop]"))
+    ['NORMAL', 'cooling OUT']
     """
-    steps = [entry.split(": ", 1)[1].split(" [", 1)[0] for entry in sequence]
-    return [step.rsplit(" -> ", 1)[-1] for step in steps]
+    steps = [entry.split(" [", 1)[0].split(": ", 1) for entry in sequence]
+    first = "sup" if any(path == "sup" for path, _ in steps) else next((path for path, _ in steps), "")
+    return [
+        step.rsplit(" -> ", 1)[-1] if path == first else f"{path} {step.rsplit(' -> ', 1)[-1]}"
+        for path, step in steps
+        if path == first or " -> " in step
+    ]
 
 
 # -- what a process keeps ------------------------------------------------------------------------------------

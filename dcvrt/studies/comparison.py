@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from dcvrt.studies.coupling import rides_of
 from dcvrt.studies.store import RUN_FAILED, Store, records
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def comparison(store: Store) -> dict[str, Any]:
     -------
     dict
         `rows`: mode, beta; for each method total_mw, by_site, passed (the replay; None where nothing is
-        hosted), false_pass (it hosts and failed) and closed; gain_mw: what the frontier hosts beyond
+        hosted), false_pass (it hosts and failed), closed_loop (whether it rides through with its facilities
+        in the network; None where that was not simulated) and closed; gain_mw: what the frontier hosts beyond
         the paper's method, None where the plan of either failed; of the frontier: margins (what binds),
         by_sequence, candidates, refused, gap, settled.
         `simulations`: by role of the hosting vector (`paper`: the samples of the fits; `frontier`: samples
@@ -40,9 +42,10 @@ def comparison(store: Store) -> dict[str, Any]:
         `hidden`: sentences on capacity that passed the replay and that the paper's fits did not allow.
     """
     plans = {(p["method"], p["mode"], p["beta"]): p for p in records(store.plans())}
+    rides = rides_of(records(store.coupling()))
     runs = [(mode, beta) for method, mode, beta in plans if method == FRONTIER]
     rows = [
-        _row(plans[PAPER, mode, beta], plans[FRONTIER, mode, beta])
+        _row(plans[PAPER, mode, beta], plans[FRONTIER, mode, beta], rides)
         for mode, beta in runs
         if (PAPER, mode, beta) in plans
     ]
@@ -56,7 +59,9 @@ def comparison(store: Store) -> dict[str, Any]:
     }
 
 
-def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any]:
+def _row(
+    paper: Mapping[str, Any], frontier: Mapping[str, Any], rides: Mapping[tuple[str, str, float], bool]
+) -> dict[str, Any]:
     row: dict[str, Any] = {"mode": frontier["mode"], "beta": frontier["beta"]}
     for name, plan in ((PAPER, paper), (FRONTIER, frontier)):
         hosts = plan["total_mw"] > 0
@@ -65,6 +70,7 @@ def _row(paper: Mapping[str, Any], frontier: Mapping[str, Any]) -> dict[str, Any
             "by_site": plan["by_site"],
             "passed": bool(plan["passed"]) if hosts else None,
             "false_pass": bool(hosts and not plan["passed"]),
+            "closed_loop": rides.get((plan["hosting"], plan["mode"], plan["beta"])) if hosts else None,
             "closed": plan["closed"],
         }
     search = frontier["search"]

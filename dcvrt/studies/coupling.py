@@ -1,20 +1,18 @@
 """Plans with their facilities in the network: how far the margins of the open loop are off.
 
-The open loop takes hosted load as an impedance in the fault. This phase simulates plans in both loops by the
-native engine: the largest plan of each mode that passed, or every plan where the study asks for the closed
-loop. Then samples and searches are in closed loop, and a plan that does not ride through there has not
-passed. Studies whose faults ANDES simulates are left alone: their case may be one that the native engine does
-not know.
+The open loop takes hosted load as an impedance in the fault. This phase simulates every plan in both loops by
+the native engine, those under system limits too. Where the study asks for the closed loop, samples and
+searches are in it, and a plan that does not ride through there has not passed. Studies whose faults ANDES
+simulates are left alone: their case may be one that the native engine does not know.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from dcvrt.planning import coupling
 from dcvrt.studies.campaign import Campaign, Task
-from dcvrt.studies.findings import SAME_SHARE
 from dcvrt.studies.setting import NO_VRT, Setting
 from dcvrt.studies.store import Store, records
 
@@ -28,11 +26,10 @@ def run_coupling(campaign: Campaign, setting: Setting) -> list[str]:
     store, grid = campaign.store, setting.file.grid
     if grid.engine == "andes":
         return []
-    closed = grid.coupling == "closed"
     plans = [plan for plan in records(store.plans()) if plan["method"] != NO_VRT and plan["total_mw"] > 0]
-    chosen = plans if closed else list(largest_passed(store, setting).values())
+    limited = [plan for plan in records(store.system_plans()) if plan["total_mw"] > 0]
     by_hosting: dict[str, tuple[list[float], set[tuple[str, float]]]] = {}
-    for plan in chosen:
+    for plan in [*plans, *limited]:
         H = [plan["by_site"][str(bus)] for bus in setting.sites]
         by_hosting.setdefault(plan["hosting"], (H, set()))[1].add((plan["mode"], plan["beta"]))
     names: dict[str, str] = {}
@@ -51,32 +48,9 @@ def run_coupling(campaign: Campaign, setting: Setting) -> list[str]:
         record(task, coupling.lost_rows(task.payload, reason))
 
     lost = campaign.run(PHASE, tasks, coupling.compare_plan, record, record_lost)
-    if closed:
+    if grid.coupling == "closed":
         _refuse(store, plans)
     return lost
-
-
-def largest_passed(store: Store, setting: Setting) -> dict[str, dict[str, Any]]:
-    """The plan of each mode with the largest total that passed replay and power flow; of equal ones, that of
-    the smallest rating. Modes without such a plan are left out."""
-    same = SAME_SHARE * max(setting.no_vrt.total_mw, 1.0)
-    plans = [
-        plan
-        for plan in records(store.plans())
-        if plan["method"] != NO_VRT
-        and plan["passed"] == 1
-        and plan["ac_passed"] == 1
-        and plan["total_mw"] > 0
-    ]
-    largest = {}
-    for mode in setting.file.facility.modes:
-        here = [plan for plan in plans if plan["mode"] == mode]
-        if here:
-            most = max(plan["total_mw"] for plan in here)
-            largest[mode] = min(
-                (plan for plan in here if plan["total_mw"] >= most - same), key=lambda plan: plan["beta"]
-            )
-    return largest
 
 
 def _refuse(store: Store, plans: list[dict[str, Any]]) -> None:
@@ -90,8 +64,13 @@ def _refuse(store: Store, plans: list[dict[str, Any]]) -> None:
 
 def rides_through(store: Store) -> dict[Run, bool]:
     """Whether the plans that were simulated in closed loop ride through there, every fault at every site."""
+    return rides_of(records(store.coupling()))
+
+
+def rides_of(rows: Iterable[Mapping[str, Any]]) -> dict[Run, bool]:
+    """The same, of rows of the store."""
     rides: dict[Run, bool] = {}
-    for row in records(store.coupling()):
+    for row in rows:
         run = (row["hosting"], row["mode"], row["beta"])
         rides[run] = rides.get(run, True) and row["passed_closed"] == 1
     return rides

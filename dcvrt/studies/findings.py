@@ -265,9 +265,30 @@ class Findings:
         """Difference below which two capacities count as equal."""
         return SAME_SHARE * max(self.no_vrt_mw, 1.0)
 
-    def best(self, mode: str | None = None) -> Row | None:
-        """The row with the largest total that passed every check; the smaller beta where totals are equal."""
-        passed = [row for row in self.rows(mode) if verdict(row) == "passed" and ac_verdict(row) == "passed"]
+    @cached_property
+    def closed_loop(self) -> dict[tuple[str, str, float], bool]:
+        """Whether plans ride through in closed loop, by hosting vector, mode and rating."""
+        from dcvrt.studies.coupling import rides_of
+        from dcvrt.studies.store import records
+
+        return rides_of(records(self.coupling))
+
+    def rides_in_closed_loop(self, row: Row) -> bool | None:
+        """Whether the plan of a row rides through in closed loop; None where that was not simulated."""
+        return self.closed_loop.get((self.plan(row)["hosting"], row["mode"], row["beta"]))
+
+    def best(self, mode: str | None = None, closed_loop: bool = False) -> Row | None:
+        """The row with the largest total that passed every check; the smaller beta where totals are equal.
+
+        With `closed_loop` among those that ride through there as well.
+        """
+        passed = [
+            row
+            for row in self.rows(mode)
+            if verdict(row) == "passed"
+            and ac_verdict(row) == "passed"
+            and (not closed_loop or self.rides_in_closed_loop(row))
+        ]
         if not passed:
             return None
         most = max(float(row["total_mw"]) for row in passed)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 COUPLING, FRONTIER, SENSITIVITY = "coupling.csv", "frontier.json", "sensitivity.json"
 SYSTEM_KEYS = (
     "mode", "beta", "limit", "limit_mw", "limit_share", "total_mw", "by_site", "passed", "ac_passed",
-    "aggregate_loss_mw", "lost_whole", "price_mw_per_mw",
+    "aggregate_loss_mw", "lost_whole", "price_mw_per_mw", "closed_loop",
 )  # fmt: skip
 """What the summary says of a plan under a system limit; `frontier.json` has the rest."""
 STORE, SUMMARY, TABLE, VALIDATION, STUDY = (

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -63,11 +63,16 @@ def system_limits(store: Store) -> dict[str, Any]:
         the replay), losses (one by one: period, fault, loss_mw, limit_mw, whole: sites that lose all),
         lost_whole (sites that do so in any), n_failed; price_mw_per_mw: hosted MW gained for each MW more
         that may be lost, 0 where the limit does not bind; candidates, refused, gap, settled, by_sequence,
-        margins of the search.
+        margins of the search; closed_loop (aggregate_loss_mw and passed once the facilities act on the
+        network; None where that was not simulated).
         `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier of the same modes and
         ratings, whose sites each meet their own criteria.
     """
-    rows = [_row(plan) for plan in records(store.system_plans())]
+    known, coupled = store.provenance(), records(store.coupling())
+    rows = [
+        _row(plan) | {"closed_loop": in_closed_loop(plan, coupled, known["periods"], known["criteria"])}
+        for plan in records(store.system_plans())
+    ]
     runs = dict.fromkeys((row["mode"], row["beta"]) for row in rows)
     plans = [p for p in records(store.plans()) if p["method"] == "frontier"]
     every = [p for p in plans if (p["mode"], p["beta"]) in runs]
@@ -101,6 +106,35 @@ def _row(plan: Mapping[str, Any]) -> dict[str, Any]:
         "price_mw_per_mw": sum(item["price"] for item in search["margins"]),
         **search,
     }
+
+
+def in_closed_loop(
+    plan: Mapping[str, Any],
+    coupled: Iterable[Mapping[str, Any]],
+    periods: Mapping[str, Mapping[str, Any]],
+    criteria: Mapping[str, Any],
+) -> dict[str, Any] | None:
+    """What a plan loses at once with its facilities in the network, and whether that is within its limit.
+
+    A run without a result there counts as lost whole, and fails the plan.
+    """
+    run = tuple(plan[name] for name in ("hosting", "mode", "beta"))
+    rows = [row for row in coupled if (row["hosting"], row["mode"], row["beta"]) == run]
+    if not rows:
+        return None
+    lost: dict[tuple[str, str], float] = {}
+    for row in rows:
+        known = row["loss_closed"] is not None and row["loss_closed"] == row["loss_closed"]
+        held = known and row["voltage_closed"] >= 0
+        share = criteria["loss_share"] - row["loss_closed"] if held else 1.0
+        place = (row["period"], row["fault"])
+        mw = periods[row["period"]]["dc_factor"] * plan["by_site"][str(row["site"])] * share
+        lost[place] = lost.get(place, 0.0) + mw
+    before = {name: period["dc_factor"] * plan["total_mw"] for name, period in periods.items()}
+    passed = all(not row["status"] for row in rows) and all(
+        mw <= plan["limit_mw"] + plan["limit_share"] * before[period] for (period, _), mw in lost.items()
+    )
+    return {"aggregate_loss_mw": max(lost.values()), "passed": passed}
 
 
 def _passed(plan: Mapping[str, Any]) -> bool | None:

@@ -19,6 +19,7 @@ def answer(findings: Findings) -> Safe:
     return section(
         "The answer",
         Safe(f'<p class="answer">{escape(headline(findings))}</p>'),
+        paragraph(in_closed_loop(findings)),
         _cards(findings),
         _warnings(findings),
     )
@@ -58,6 +59,29 @@ def headline(findings: Findings) -> str:
         f"{best['total_mw']:.1f} MW of data-centre load can be hosted with ride-through: {places}. It "
         f"takes {takes} (the least rating studied that passed). That is {share:.0f} % of the {limit:.1f} "
         "MW that the grid could host if no site had to ride through faults."
+    )
+
+
+def in_closed_loop(findings: Findings) -> str:
+    """What of the answer is left when the facilities act back on the network in the fault."""
+    if findings.best() is None or not findings.closed_loop:
+        return (
+            "The verdicts take hosted load as an impedance in the fault; no plan was simulated with its "
+            "facilities acting back on the network."
+        )
+    said = []
+    for mode in findings.modes:
+        best, row = findings.best(mode), findings.best(mode, closed_loop=True)
+        if best is None:
+            continue
+        if row is None:
+            said.append(f"{mode_name(mode)}: none of the plans")
+        else:
+            said.append(f"{mode_name(mode)}: {row['total_mw']:.1f} MW at β = {row['beta']:g}")
+    return (
+        "These plans are judged with hosted load as an impedance in the fault. Facilities also act back on "
+        "the network through their control (closed loop). The largest plan at the ratings studied that rides "
+        f"through in closed loop as well is, with {'; with '.join(said)}."
     )
 
 

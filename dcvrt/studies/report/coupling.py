@@ -36,8 +36,8 @@ def coupling(findings: Findings) -> Safe:
         )
     else:
         asked = (
-            "Samples, searches and replays take hosted load as an impedance in the fault (open loop). As the "
-            "study asks, only the largest plan of each mode is compared; its verdict stays that of the open "
+            "Samples, searches and replays take hosted load as an impedance in the fault (open loop). Every "
+            "plan is compared; its verdict elsewhere in this report stays that of the open "
             'loop. coupling = "closed" in [grid] searches for plans that ride through in closed loop.'
         )
     largest = [findings.best(mode) for mode in findings.modes]

@@ -47,11 +47,16 @@ def frontier(findings: Findings) -> Safe:
         ),
         table(
             "Both methods at every mode and rating",
-            ["mode", "β", "paper (MW)", "sites (MW)", "replay", "frontier (MW)", "sites (MW)", "replay",
-             "gain (MW)",
-             "what binds the frontier"],
+            ["mode", "β", "paper (MW)", "sites (MW)", "replay", "closed loop", "frontier (MW)", "sites (MW)",
+             "replay", "closed loop", "gain (MW)", "what binds the frontier"],
             [_cells(row) for row in found["rows"]],
-            words=[3, 6, 9],
+            words=[3, 7, 11],
+        ),
+        paragraph(
+            "Closed loop: whether the plan also rides through with its facilities acting on the network, by "
+            "the native engine; the replay takes hosted load as an impedance (see Facilities in the "
+            "network). Gain: what the frontier hosts beyond the paper's method at equal safety, where the "
+            "plans of both passed the replay."
         ),
         paragraph(
             f"False passes of the paper's fits: {len(false)}. "
@@ -89,7 +94,8 @@ def _cells(row: Mapping[str, Any]) -> list[object]:
     for method in ("paper", "frontier"):
         found = row[method]
         verdict = {True: "passed", False: "failed", None: "nothing hosted"}[found["passed"]]
-        cells += [number(found["total_mw"], 2), buses(found["by_site"]), badge(verdict)]
+        loop = {True: badge("passed"), False: badge("failed"), None: "–"}[found["closed_loop"]]
+        cells += [number(found["total_mw"], 2), buses(found["by_site"]), badge(verdict), loop]
     return [*cells, "–" if row["gain_mw"] is None else number(row["gain_mw"], 2), _binding(row)]
 
 

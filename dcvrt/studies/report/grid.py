@@ -46,12 +46,14 @@ def grid(findings: Findings) -> Safe:
         ]
         for name, p in findings.periods.items()
     ]
+    study = findings.study
     parts = [
         paragraph(
-            f"Network: {findings.study.grid.case}. Candidate sites: bus "
+            f"Network: {study.grid.case}. Candidate sites: bus "
             f"{', '.join(map(str, findings.sites))}. Faults are three-phase, at buses without a data "
-            f"centre, and clear by themselves or with the branch that opens; simulated with "
-            f"{findings.study.grid.engine}."
+            "centre, and clear by themselves or with the branch that opens. Samples and searches are "
+            f"simulated by {_engine(study.grid.engine)}, the replays of plans by "
+            f"{_engine(study.replay.engine)}."
         )
     ]
     picture = findings.folder / "figures" / "network_map.svg"
@@ -108,3 +110,7 @@ def _map_text(findings: Findings) -> str:
         f"{', '.join(map(str, findings.wind_buses))}, faults at bus "
         f"{', '.join(str(f.bus) for f in findings.faults)}."
     )
+
+
+def _engine(name: str) -> str:
+    return "ANDES" if name == "andes" else "the native engine"

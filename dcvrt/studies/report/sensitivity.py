@@ -7,7 +7,7 @@ from typing import Any
 
 from dcvrt.studies.figures.sensitivity import by_gradient, drawn, rows_of
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.report.page import Safe, bullets, escape, figure, paragraph, section, table
+from dcvrt.studies.report.page import Safe, bullets, escape, figure, notice, paragraph, section, table
 from dcvrt.studies.sensitivity import SHOWN
 from dcvrt.studies.style import mode_name
 
@@ -24,6 +24,16 @@ def sensitivity(findings: Findings) -> Safe:
         return section(TITLE, *map(paragraph, missing), name=ANCHOR)
     spent = findings.provenance.get("sensitivity_runs", {"grid": 0, "facility": 0})
     parts = [
+        notice(
+            "In open loop only",
+            paragraph(
+                "Every number of this section takes hosted load as an impedance in the fault, so that the "
+                "voltages do not move with what is varied. Where a facility acts on the network, the same "
+                "change of an assumption moves the voltages too; how far the plans are off in closed loop is "
+                "told in Facilities in the network."
+            ),
+            "neutral",
+        ),
         paragraph(
             "How many MW more or fewer would be hosted if an assumption of the facility or of the criteria "
             "were another? By gradients: the margins that hold a plan, or are near to that, are shifted by "

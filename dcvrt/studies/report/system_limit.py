@@ -27,7 +27,8 @@ def system_limit(findings: Findings) -> Safe:
             "long as the loss of all of them together stays within a limit, in every fault and period. The "
             "loss of a site is the share of its import that is gone for the whole loss window; a site whose "
             "protected voltage is not held, or whose run ended before its time, counts with all of its load, "
-            "since its servers drop off. Every plan was replayed by the engine of all replays."
+            "since its servers drop off. Every plan was replayed by the engine of all replays, and simulated "
+            "once more in closed loop, with its facilities acting on the network."
         ),
         paragraph(
             "For scale: in an event of July 2024 that NERC reviewed, some 1,500 MW of data-centre load "
@@ -37,6 +38,20 @@ def system_limit(findings: Findings) -> Safe:
         ),
         paragraph(_tried(findings)),
     ]
+    turned = [row for row in rows if row["closed_loop"] is not None and not row["closed_loop"]["passed"]]
+    if turned:
+        parts.append(
+            notice(
+                f"{len(turned)} plan(s) lose more than their limit once their facilities act on the network",
+                bullets(
+                    [
+                        f"{_name(row)}: {row['total_mw']:.1f} MW, loses "
+                        f"{row['closed_loop']['aggregate_loss_mw']:.1f} MW at once"
+                        for row in turned
+                    ]
+                ),
+            )
+        )
     failed = [row for row in rows if row["passed"] is False]
     if failed:
         parts.append(
@@ -65,7 +80,8 @@ def system_limit(findings: Findings) -> Safe:
         table(
             "Plans within a limit on the load lost at once",
             ["mode", "β", "limit", "hosted (MW)", "sites (MW)", "lost at once (MW)", "in the worst fault",
-             "lost whole in some fault", "replay", "gain (MW per MW)"],
+             "lost whole in some fault", "replay", "lost at once in closed loop (MW)", "closed loop",
+             "gain (MW per MW)"],
             [_cells(row) for row in rows],
             words=[4, 6],
         )
@@ -148,6 +164,7 @@ def _reservations(rows: Sequence[Mapping[str, Any]]) -> list[Safe]:
 
 
 def _cells(row: Mapping[str, Any]) -> list[object]:
+    loop = row["closed_loop"]
     worst = max(row["losses"], key=lambda entry: entry["loss_mw"], default=None)
     return [
         mode_name(row["mode"]),
@@ -159,6 +176,8 @@ def _cells(row: Mapping[str, Any]) -> list[object]:
         "–" if worst is None else f"{worst['fault']}, {worst['period']}",
         ", ".join(f"bus {bus}" for bus in row["lost_whole"]) or "–",
         badge(VERDICTS[row["passed"]]),
+        "–" if loop is None else number(loop["aggregate_loss_mw"], 2),
+        "–" if loop is None else badge(VERDICTS[loop["passed"]]),
         number(row["price_mw_per_mw"], 2) if row["price_mw_per_mw"] > 0 else "–",
     ]
 
