@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 SIGNALS = ("v_it", "p_g", "q_g", "i_g", "p_b", "soc", "w_dc", "p_out", "mode")
 """Facility outputs that are kept of the worst cases."""
 SIGNAL_UNITS = {"v_it": "pu", "i_g": "pu", "soc": "1", "w_dc": "1", "mode": "1"}
+MAIN = ("sup", "control")
+"""Blocks whose modes say how a facility is fed: a variant has one of them, or is fed in one way only."""
 SAVE_AT = 2e-3
 """Distance of the samples that are kept, s."""
 
@@ -307,7 +309,7 @@ def lowest_voltage(waveform: Waveform, wrt: Sequence[str] = ()) -> tuple[float, 
 
 
 def modes_passed(sequence: Sequence[str]) -> list[str]:
-    """Modes of the supervisor in the order in which they were entered, from the event sequence of a run.
+    """Modes of the block that decides how a facility is fed, in the order in which they were entered.
 
     What other automata enter stands between them, with the path of its block.
 
@@ -317,7 +319,8 @@ def modes_passed(sequence: Sequence[str]) -> list[str]:
     ['NORMAL', 'cooling OUT']
     """
     steps = [entry.split(" [", 1)[0].split(": ", 1) for entry in sequence]
-    first = "sup" if any(path == "sup" for path, _ in steps) else next((path for path, _ in steps), "")
+    paths = [path for path, _ in steps]
+    first = next((path for path in [*MAIN, *paths] if path in paths), "")
     return [
         step.rsplit(" -> ", 1)[-1] if path == first else f"{path} {step.rsplit(' -> ', 1)[-1]}"
         for path, step in steps

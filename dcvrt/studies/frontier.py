@@ -124,7 +124,7 @@ def _mechanism(store: Store, setting: Setting, plan: Mapping[str, Any], item: Ma
     if not run.completed or here.empty or not here.ok.iloc[0]:
         return "not known: the run has no result"
     window = 1e-3 * (file.criteria.loss_window_ms if target == "loss" else file.criteria.window_ms)
-    modes = next(a.modes for a in simulator.dae.automata if a.path == "sup")
+    modes = next((a.modes for a in simulator.dae.automata if a.path in replay.MAIN), ())
     return mechanism(run, modes, target, here.diagnostics.iloc[0][f"{target}_time"], window)
 
 

@@ -67,6 +67,22 @@ def test_most_of_the_window_decides() -> None:
     assert told(Signals(share=0.3, mode=2.0)) == "control"
 
 
+def test_time_counts_not_samples() -> None:
+    """Samples crowd where signals turn, as in the first milliseconds of a fault."""
+    run = Signals(i_g=1.1)
+    early = np.linspace(0.5, 0.51, 200, endpoint=False)
+    run.signals = {
+        name: np.append(np.full(len(early), 0.5 if name == "i_g" else of[250]), of[256:])
+        for name, of in run.signals.items()
+    }
+    run.t = np.append(early, run.t[256:])
+    assert told(run) == "limiter"
+
+
+def test_a_variant_without_a_supervisor_is_never_away() -> None:
+    assert mechanism(Signals(mode=2.0, i_g=1.1), (), "loss", 0.5, WINDOW) == "limiter"  # type: ignore[arg-type]
+
+
 def test_a_window_between_samples_takes_the_nearest() -> None:
     assert told(Signals(i_g=1.1), time=0.5203, window=0.0) == "limiter"
     assert told(Signals(i_g=1.1), time=0.4003, window=0.0) == "control"

@@ -83,14 +83,14 @@ def run(folder: Path, given: Any) -> tuple[list[str], dict[float, int], list[dic
         return lost, verdicts, records(store.coupling())
 
 
-def test_only_the_largest_plan_is_compared_and_keeps_its_verdict(
+def test_every_plan_is_compared_and_keeps_its_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(planning, "compare_plan", lambda r: asked.append(r["runs"]) or answer(r))
     lost, verdicts, rows = run(tmp_path, setting("open"))
-    assert (lost, asked) == ([], [[("gfl", 1.3)]])  # 60 MW at the smallest rating; once
-    assert [row["beta"] for row in rows] == [1.3]
+    assert (lost, sorted(asked)) == ([], [[("gfl", 1.2)], [("gfl", 1.3)], [("gfl", 1.4)]])  # once each
+    assert sorted(row["beta"] for row in rows) == [1.2, 1.3, 1.4]
     assert set(verdicts.values()) == {1}
 
 
