@@ -182,7 +182,7 @@ def one_sided(data: MarginData) -> list[str]:
     A fit to such samples is an extrapolation wherever it says the other side.
     """
     said = []
-    for place in _places(data, period=False):
+    for place in data.grouped("mode", "beta", "site", "fault"):
         here = place[data.fit[place] & data.ok[place]]
         first = place[0]
         what = (
@@ -203,11 +203,10 @@ def _fitted(data: MarginData, method: str) -> Floats:
     """Predictions of the tightened least-squares fits at every run, (runs, 2); -inf where they say
     nothing."""
     predicted = np.full((len(data.site), 2), -np.inf)
+    columns = ["site", "fault", "mode", *([] if method == "paper" else ["period", "beta"])]
+    places = {tuple(getattr(data, c)[at[0]] for c in columns): at for at in data.grouped(*columns)}
     for fit in fit_surrogates(data, method):
-        here = (data.site == fit.site) & (data.fault == fit.fault) & (data.mode == fit.mode)
-        if fit.period:
-            here &= (data.period == fit.period) & (data.beta == fit.beta)
-        at = np.flatnonzero(here)
+        at = places[tuple(getattr(fit, c) for c in columns)]
         own = data.sites.index(fit.site)
         values = fit.predict(data.hosting[at], data.d[at], data.beta[at], own)
         silent = [(b, p) in fit.unknown for b, p in zip(data.beta[at], data.period[at], strict=True)]
@@ -218,7 +217,7 @@ def _fitted(data: MarginData, method: str) -> Floats:
 def _per_margin(data: MarginData, method: str, slopes: Floats | None, margin: dict[str, Floats]) -> Floats:
     """Predictions of the forms that are fitted to each margin by itself."""
     predicted = np.full((len(data.site), 2), -np.inf)
-    for place in _places(data, period=True):
+    for place in data.grouped("mode", "beta", "site", "fault", "period"):
         used = place[data.fit[place] & data.ok[place]]
         if len(used) < data.hosting.shape[1] + 2:
             continue
@@ -235,21 +234,9 @@ def _per_margin(data: MarginData, method: str, slopes: Floats | None, margin: di
     return predicted
 
 
-def _places(data: MarginData, period: bool) -> list[Integers]:
-    """Positions of the runs of each mode, rating, site and fault, and of each period by itself."""
-    keys = [data.mode, data.beta, data.site, data.fault, *([data.period] if period else [])]
-    _, group = np.unique(np.rec.fromarrays(keys), return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    return list(np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
-
-
 def _together(
     data: MarginData, holds: npt.NDArray[np.bool_], where: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.bool_]:
     """Whether something holds in every period and fault, for each vector, site, mode and rating."""
-    at = np.flatnonzero(where)
-    keys = np.rec.fromarrays([data.name[at], data.site[at], data.mode[at], data.beta[at]])
-    _, group = np.unique(keys, return_inverse=True)
-    broken = np.zeros(int(group.max()) + 1, dtype=bool)
-    np.logical_or.at(broken, group, ~holds[at])
-    return ~broken
+    groups = [at[where[at]] for at in data.grouped("name", "site", "mode", "beta")]
+    return np.array([holds[at].all() for at in groups if len(at)], dtype=bool)

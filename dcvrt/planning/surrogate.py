@@ -26,8 +26,9 @@ a false pass when the surrogate passes it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -186,6 +187,22 @@ class MarginData:
                     problems.append(f"{key} is not finite in {bad} run(s) that are marked ok.")
         raise_all(problems, "margins", InputError)
 
+    @cached_property
+    def _coded(self) -> dict[str, tuple[int, npt.NDArray[np.int64]]]:
+        return {}
+
+    def grouped(self, *columns: str) -> list[npt.NDArray[np.int64]]:
+        """Positions of the runs that are alike in some columns, in the order of their values."""
+        group = np.zeros(len(self.site), dtype=np.int64)
+        for name in columns:
+            if name not in self._coded:  # comparing texts once is what takes the time
+                values, code = np.unique(getattr(self, name), return_inverse=True)
+                self._coded[name] = (len(values), code)
+            count, code = self._coded[name]
+            group = group * count + code
+        order = np.argsort(group, kind="stable")
+        return list(np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
+
     def margin(self, target: str, method: str) -> Floats:
         """The margin that `method` fits for `target`."""
         if target == "voltage":
@@ -276,20 +293,10 @@ def fit_surrogates(data: MarginData, method: str) -> list[Surrogate]:
     fit = _fit_paper if method == "paper" else _fit_share
     return [
         surrogate
-        for chosen in _groups(data, by_beta=method == "share")
+        for chosen in data.grouped("mode", "site", "fault", *(["beta"] if method == "share" else []))
         for target in TARGETS
         for surrogate in fit(data, chosen, target)
     ]
-
-
-def _groups(data: MarginData, by_beta: bool) -> Iterator[npt.NDArray[np.int64]]:
-    """Positions of the runs that one fit is made from, in a fixed order."""
-    keys = np.rec.fromarrays(
-        [data.mode, data.site, data.fault, data.beta if by_beta else np.zeros(len(data.site))]
-    )
-    _, group = np.unique(keys, return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    yield from np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
 def _fit_paper(data: MarginData, chosen: npt.NDArray[np.int64], target: str) -> list[Surrogate]:
