@@ -27,11 +27,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 METHOD_LINES = ("-", (0, (4, 2)), (0, (1, 1.5)))
+RING: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 10,
+    "markerfacecolor": "none",
+    "markeredgecolor": FAILED,
+    "markeredgewidth": 1.2,
+}
 METHOD_TEXT = {"share": "share fit", "paper": "paper's fit"}
 
 
 def draw_totals(findings: Findings) -> Figure:
-    """Total capacity against beta, a panel a mode, a line a method; failed plans are crossed out."""
+    """Total capacity against beta, a panel a mode, a line a method; failed plans are crossed out, and those
+    that fail only in closed loop are ringed."""
     modes, methods = findings.modes, findings.methods
     figure = new_figure(PAGE, 2.75)
     panels = figure.subplots(1, len(modes), sharey=True, squeeze=False)[0]
@@ -53,6 +62,8 @@ def draw_totals(findings: Findings) -> Figure:
                 zorder=3 + k,
             )
             cross_failed(axes, rows, [row["total_mw"] for row in rows])
+            turned = [row for row in rows if _turned(findings, row)]
+            axes.plot([row["beta"] for row in turned], [row["total_mw"] for row in turned], **RING, zorder=8)
         axes.set_xlabel("converter rating over capacity, β")
         panel(axes, letter, mode_name(mode))
     panels[0].set_ylabel("hosted capacity (MW)")
@@ -60,8 +71,18 @@ def draw_totals(findings: Findings) -> Figure:
         -0.02 * findings.no_vrt_mw,
         1.12 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]),
     )
-    _legend(figure, panels[0], any(verdict(row) == "failed" for row in findings.rows()))
+    _legend(
+        figure,
+        panels[0],
+        any(verdict(row) == "failed" for row in findings.rows()),
+        any(_turned(findings, row) for row in findings.rows()),
+    )
     return figure
+
+
+def _turned(findings: Findings, row: Row) -> bool:
+    """Whether a plan passed the replay and does not ride through in closed loop."""
+    return verdict(row) == "passed" and findings.rides_in_closed_loop(row) is False
 
 
 def draw_allocation(findings: Findings) -> Figure:
@@ -148,7 +169,7 @@ def _patch(colour: str, hatch: str, label: str) -> object:
     return Patch(facecolor=colour, hatch=hatch, edgecolor="white", label=label)
 
 
-def _legend(figure: Figure, axes: Axes, failed: bool) -> None:
+def _legend(figure: Figure, axes: Axes, failed: bool, turned: bool) -> None:
     """One legend for all panels: lines in ink, since the panel already tells the mode."""
     from matplotlib.lines import Line2D
 
@@ -183,4 +204,6 @@ def _legend(figure: Figure, axes: Axes, failed: bool) -> None:
                 label="failed the replay",
             )
         )
+    if turned:
+        handles.append(Line2D([], [], **RING, label="fails in closed loop"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 # (text, what passes on to the next box), in the order of the chain
 STEPS = (
-    ("Hosting proposal", "H at each site, MW", "samples up to the plan without ride-through"),
-    ("Fault simulation", "network fault, operating hour", "ANDES, rebuilt for every H and period"),
+    ("Hosting proposal", "H at each site, MW", "samples, or candidates of the frontier"),
+    ("Fault simulation", "network fault, operating hour", "the grid is rebuilt for every H and period"),
     ("POI waveform", "complex voltage over time", "one at each site"),
     ("Facility model", "GFL or GFM, rating β H", "loads, DC link, UPS, battery, supervisor"),
     ("Margins", "sustained voltage, load loss", "failed runs are labelled, never a pass"),
-    ("Surrogate rows", "affine in H, tightened", "checked on samples kept out of the fit"),
+    ("Ride-through rows", "affine in H", "fits of samples, tightened, or exact cuts at candidates"),
     ("Hosting programme", "largest total H", "every hour of the year, every limit, every row"),
     ("Replay", "pass or fail", "the whole chain again, at the plan itself"),
 )

@@ -79,8 +79,13 @@ def draw(
             ha="center",
             va="center",
         )
-    _symbols(axes, at, towards, faults, "X", FAILED, 58, "white")
-    _symbols(axes, at, towards, wind, "^", PALETTE[2], 62, "white")
+    # A bus may have wind and a fault: the triangle is then drawn larger, and the cross on it.
+    both = set(wind) & set(faults)
+    for bus in both:
+        axes.scatter(*at[bus], s=300, marker="^", facecolor=PALETTE[2], edgecolor="white", zorder=4.5)
+    _symbols(axes, at, towards, [bus for bus in wind if bus not in both], "^", PALETTE[2], 62, "white")
+    for bus in faults:
+        _symbols(axes, at, towards, [bus], "X", FAILED, 58, "white", 300 if bus in both else 58)
     area = {site: 70.0 if capacity_mw is None else 30.0 + 1.0 * capacity_mw.get(site, 0.0) for site in sites}
     for site in sites:
         _symbols(axes, at, towards, [site], "s", PALETTE[0], area[site], "white")
@@ -114,14 +119,16 @@ def _symbols(
     colour: str,
     area: float,
     edge: str,
+    reach: float | None = None,
 ) -> None:
+    """Mark buses; their numbers stand clear of a symbol of the area `reach`, by default of their own."""
     for bus in buses:
         x, y = at[bus]
         axes.scatter(x, y, s=area, marker=marker, facecolor=colour, edgecolor=edge, linewidth=0.7, zorder=5)
         axes.annotate(
             str(bus),
             (x, y),
-            (0.55 * area**0.5 + np.array([3.0 + 2.2 * len(str(bus)), 5.0])) * towards[bus],
+            (0.55 * (reach or area) ** 0.5 + np.array([3.0 + 2.2 * len(str(bus)), 5.0])) * towards[bus],
             textcoords="offset points",
             fontsize=7.5,
             ha="center",

@@ -112,7 +112,8 @@ def plans(findings: Findings) -> Safe:
             alt=_capacity_alt(findings),
             caption=(
                 "Hosted capacity against the converter rating β. A red cross is a plan that failed the "
-                "replay. The dashed grey line is the capacity without ride-through."
+                "replay, a red ring one that passed it and fails in closed loop. The dashed grey line is the "
+                "capacity without ride-through."
             ),
         ),
         figure(
