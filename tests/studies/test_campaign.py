@@ -103,6 +103,69 @@ def test_a_poison_task_is_quarantined_and_the_others_finish(tmp_path: Path) -> N
     assert results == {}
 
 
+def logged(payload: dict) -> int:
+    with open(payload["log"], "a") as log:
+        log.write(f"{payload['n']}\n")
+    if payload["n"] == payload.get("poison") and payload["n"] == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.05)
+    return int(payload["n"])
+
+
+def wait_for(done) -> None:
+    deadline = time.monotonic() + 60
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("poison", [None, 1])
+def test_idle_workers_do_later_tasks_once_and_leave_one_place(tmp_path: Path, poison: int | None) -> None:
+    """While the master searches, the tasks of a later phase are done one at a time; those of the phase that
+    runs come before them; a task that kills its worker is set aside in its own phase and no other with it."""
+    log = tmp_path / "log.txt"
+    log.touch()
+
+    def named(phase: str, numbers: range) -> list[Task]:
+        return [Task(phase, {"n": n, "log": str(log), "poison": poison}) for n in numbers]
+
+    later, now = named("later", range(8)), named("now", range(100, 104))
+    results: list[int] = []
+    lost: list[int] = []
+    with Store(tmp_path / "study.sqlite", write=True) as store, crew_of(2) as crew:
+        campaign = Campaign(store, crew, timeout_s=30.0, tries=2)
+        campaign.ahead("later", later, logged)
+        wait_for(lambda: len(log.read_text().split()) >= 3)  # nobody has asked for them yet
+        assert not store.task_states("later"), "nothing is written before the phase"
+        for phase, wanted in (("now", now), ("later", later)):
+            campaign.run(
+                phase,
+                wanted,
+                logged,
+                lambda task, n: results.append(n),
+                lambda task, why: lost.append(task.payload["n"]),
+            )
+        states = {key: state for key, (state, _) in store.task_states("later").items()}
+        campaign.ahead("later", later, logged)  # nothing is left to do
+        time.sleep(0.3)
+    assert lost == ([] if poison is None else [1])
+    assert sorted([*results, *lost]) == [*range(8), *range(100, 104)]
+    assert set(states.values()) == ({"done"} if poison is None else {"done", "quarantined"})
+    starts = [int(n) for n in log.read_text().split()]
+    assert sorted(set(starts)) == [*range(8), *range(100, 104)]
+    again = [n for n in set(starts) if starts.count(n) > 1]
+    assert again == ([] if poison is None else [1])
+
+
+def test_one_process_does_nothing_ahead_of_its_phase(tmp_path: Path) -> None:
+    log = tmp_path / "log.txt"
+    log.touch()
+    with Store(tmp_path / "study.sqlite", write=True) as store, crew_of(1) as crew:
+        Campaign(store, crew).ahead("later", [Task("later", {"n": 0, "log": str(log)})], logged)
+        assert not log.read_text()
+        assert not store.task_states("later")
+
+
 SLOW_RUN = """
 import sys, time
 from pathlib import Path
