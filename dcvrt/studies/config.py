@@ -53,7 +53,7 @@ class GridSection(Section):
     coupling: Literal["open", "closed"] = Field(
         default="open",
         description="'closed': samples and searches simulate facilities in the network, and a plan passes "
-        "only if it rides through there too; 'open': told of the largest plan of each mode",
+        "only if it rides through there too; 'open': told of every plan",
     )
     t_end_s: Positive = Field(default=2.0, description="length of every fault simulation")
     step_s: float = Field(default=1 / 120, gt=0, le=0.05, description="step of the fault simulation")
@@ -160,7 +160,7 @@ class CriteriaSection(Section):
 class SamplingSection(Section):
     """`[sampling]`: the hosting vectors that the surrogates learn from."""
 
-    n: int = Field(default=24, ge=6, le=4096, description="number of hosting vectors")
+    n: int = Field(default=32, ge=6, le=4096, description="number of hosting vectors")
     validation_share: Share = Field(default=0.25, description="share of them kept out of the fit")
     gradients: bool = Field(
         default=False,

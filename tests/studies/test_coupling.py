@@ -16,6 +16,7 @@ from dcvrt.studies.campaign import Campaign, InProcess
 from dcvrt.studies.config import load
 from dcvrt.studies.findings import Findings
 from dcvrt.studies.report import coupling as report
+from dcvrt.studies.report.answer import in_closed_loop
 from dcvrt.studies.simulations import hosting_row
 from dcvrt.studies.store import Store, records
 from tests.studies.synthetic import make
@@ -142,6 +143,10 @@ def test_the_report_tells_how_far_the_open_loop_is_off(tmp_path: Path) -> None:
     told = words(report.coupling(findings))
     assert "-0.0100 -0.0010 -0.0500 2 1 0 passed FAILED" in told  # voltage, margins, runs, sequence, verdicts
     assert "bus 25, 100 ms peak 75 0.6200 0.6100 0.0800 0.0790 0.0200 -0.0300 no" in told
+    assert "with GFL: none of the plans; with GFM:" in in_closed_loop(findings)
+    assert findings.best("gfm") == best
+    turned = findings.best("gfm", closed_loop=True)
+    assert turned is None  # the one plan that was simulated there fails
     (sentence,) = report.turned(findings)
     assert "1 of 2 runs, the first at bus 75, fault bus 25, 100 ms, peak: a margin is negative" in sentence
 

@@ -23,6 +23,7 @@ from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 from dcvrt.studies.study import Result
 from dcvrt.studies.style import styled
+from dcvrt.studies.system_limit import in_closed_loop
 from tests.planning.test_requirement import SITES as BUSES
 from tests.planning.test_requirement import D, exact
 from tests.studies.stand_in import WORSE, run, setting, stand_in
@@ -257,6 +258,35 @@ def test_sentences_compare_with_sites_that_all_ride_through() -> None:
         "which up to 12.0 MW are lost at once. Within 10 MW more is hosted and less is lost.",
         "GFM, β = 1.1: no limit lets it host. With every site riding through nothing can be hosted.",
     ]
+
+
+def test_in_closed_loop_the_losses_of_all_sites_are_added_up() -> None:
+    """By hand: 100 MW at 0.9, of which 60 at bus 21 lose 0.1 and 40 at bus 75 lose 0.3."""
+    plan = {
+        "hosting": "p1", "mode": "gfl", "beta": 1.15, "total_mw": 100.0, "by_site": {"21": 60.0, "75": 40.0},
+        "limit_mw": 16.0, "limit_share": 0.0,
+    }  # fmt: skip
+    place = {"hosting": "p1", "mode": "gfl", "beta": 1.15, "period": "peak", "fault": "bus 25", "status": ""}
+    rows = [
+        place | {"site": 21, "loss_closed": 0.15, "voltage_closed": 0.05},
+        place | {"site": 75, "loss_closed": -0.05, "voltage_closed": 0.05},
+        place | {"hosting": "p2", "site": 75, "loss_closed": -0.7, "voltage_closed": 0.05},
+    ]
+    periods, criteria = {"peak": {"dc_factor": 0.9}}, {"loss_share": 0.25}
+
+    def told(rows: list[dict[str, Any]], **limit: float) -> tuple[float, bool]:
+        found = in_closed_loop(plan | limit, rows, periods, criteria)
+        assert found is not None
+        return found["aggregate_loss_mw"], found["passed"]
+
+    assert told(rows) == (pytest.approx(0.9 * (60 * 0.1 + 40 * 0.3)), False)
+    assert told(rows, limit_mw=0.0, limit_share=0.2) == (pytest.approx(16.2), True)
+    unheld = [rows[0] | {"voltage_closed": -0.01}, rows[1]]  # servers drop off: all of it
+    assert told(unheld, limit_mw=70.0) == (pytest.approx(0.9 * (60 + 40 * 0.3)), True)
+    nan = float("nan")
+    failed = [rows[0] | {"loss_closed": nan, "voltage_closed": nan, "status": "no run"}, rows[1]]
+    assert told(failed, limit_mw=100.0) == (pytest.approx(0.9 * (60 + 40 * 0.3)), False)
+    assert in_closed_loop(plan, [], periods, criteria) is None
 
 
 def test_without_limits_there_is_neither_page_nor_figure(tmp_path: Path) -> None:
