@@ -82,7 +82,8 @@ def draw(
     # A bus may have wind and a fault: the triangle is then drawn larger, and the cross on it.
     both = set(wind) & set(faults)
     for bus in both:
-        axes.scatter(*at[bus], s=300, marker="^", facecolor=PALETTE[2], edgecolor="white", zorder=4.5)
+        x, y = at[bus]
+        axes.scatter(x, y, s=300, marker="^", facecolor=PALETTE[2], edgecolor="white", zorder=4.5)
     _symbols(axes, at, towards, [bus for bus in wind if bus not in both], "^", PALETTE[2], 62, "white")
     for bus in faults:
         _symbols(axes, at, towards, [bus], "X", FAILED, 58, "white", 300 if bus in both else 58)
