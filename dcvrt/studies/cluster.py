@@ -4,8 +4,8 @@ As many tasks are handed out as there are workers, no more: so the time of a tas
 handed out, and a dying worker takes one task with it. A task whose worker died is done again alone, with
 nothing else running beside it, so that no task is blamed for another's death.
 
-Tasks that a later phase will ask for may be named ahead. A worker that has nothing else to do takes them up,
-one place always left to this process, which searches meanwhile.
+Tasks that a later phase will ask for may be named ahead, those named last to be done first. A worker that has
+nothing else to do takes them up, one place always left to this process, which searches meanwhile.
 """
 
 from __future__ import annotations
@@ -152,7 +152,8 @@ class Cluster:
     def ahead(self, tasks: Sequence[Task], function: TaskFunction) -> None:
         """See `Crew`."""
         with self._lock:
-            self._later |= {task.key: (task, function) for task in tasks if task.key not in self._early}
+            named = {task.key: (task, function) for task in tasks if task.key not in self._early}
+            self._later = named | self._later
         self._take_up(1)
 
     def _take_up(self, taken: int | None = None) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from dcvrt.studies.coupling import rides_of
-from dcvrt.studies.store import RUN_FAILED, Store, records
+from dcvrt.studies.store import DETAILS, RUN_FAILED, Store, records
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,7 +95,7 @@ def fault_runs(store: Store, margins: pd.DataFrame) -> pd.DataFrame:
 
 
 def _simulations(store: Store) -> dict[str, dict[str, int]]:
-    margins = store.margins(gradients=False)
+    margins = store.margins(leave=DETAILS)
     role = dict(zip(store.hostings().name, store.hostings().role, strict=True))
     margins = margins.assign(kind=[KINDS[role[name]] for name in margins.hosting])
     spent = {}

@@ -80,7 +80,7 @@ class Findings:
     def margins(self) -> pd.DataFrame:
         """Every checked facility run, of samples and plans, without its gradients."""
         with self._store() as store:
-            return store.margins(gradients=False)
+            return store.margins(leave=["gradients"])
 
     @cached_property
     def hostings(self) -> pd.DataFrame:

@@ -17,7 +17,7 @@ from dcvrt.errors import InputError
 from dcvrt.planning.surrogate import score
 from dcvrt.studies.campaign import LOST
 from dcvrt.studies.comparison import comparison, fault_runs
-from dcvrt.studies.store import RUN_FAILED, Store, records
+from dcvrt.studies.store import DETAILS, RUN_FAILED, Store, records
 from dcvrt.studies.system_limit import system_limits
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def simulations(store: Store) -> dict[str, int]:
 
     A fault without a waveform is one failure, however many facility runs it would have fed.
     """
-    margins, tasks = store.margins(gradients=False), store.tasks()
+    margins, tasks = store.margins(leave=DETAILS), store.tasks()
     faults = fault_runs(store, margins[margins.failed_in != "task"])
     ran = margins[margins.failed_in.isin(["", *RUN_FAILED])]
     return {

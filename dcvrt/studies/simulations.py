@@ -12,7 +12,7 @@ from dcvrt.planning.requirement import SystemLimit
 from dcvrt.planning.verdict import limit_verdict, verdict
 from dcvrt.studies.campaign import Campaign, Task
 from dcvrt.studies.setting import NO_VRT, REACTIVE, Setting
-from dcvrt.studies.store import Store, records
+from dcvrt.studies.store import DETAILS, Store, records
 
 SAMPLES, FRONTIER, CANDIDATES, REPLAYS = "samples", "frontier", "candidates", "replays"
 """What is simulated: samples of the fits; points of the frontier's search; its candidates, by the engine of
@@ -73,7 +73,7 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
             wanted.setdefault(plan["hosting"], (_hosted(plan, setting), set()))[1].add(
                 (plan["mode"], plan["beta"])
             )
-    replayed = store.margins(hosting=list(wanted), gradients=False)[PLAN]
+    replayed = store.margins(hosting=list(wanted), leave=DETAILS)[PLAN]
     made = {tuple(key) for key in replayed.itertuples(index=False)}
     lost = replay_plans(
         campaign,
@@ -97,7 +97,7 @@ def write_verdicts(
 ) -> None:
     """Judge plans, and such under system limits, by their replays."""
     names = list({plan["hosting"] for plan in [*plans, *limited]})
-    replayed = store.margins(hosting=names, gradients=False)
+    replayed = store.margins(hosting=names, leave=DETAILS)
     runs_of = {key: records(rows) for key, rows in replayed.groupby(PLAN)}
     places = len(setting.periods) * len(setting.file.fault)
     with store.transaction():

@@ -139,6 +139,8 @@ TABLES = {
     "passed_closed INTEGER, same_sequence INTEGER NOT NULL, status TEXT NOT NULL, "
     "PRIMARY KEY (hosting, mode, beta, period, fault, site)",
 }
+DETAILS = ("diagnostics", "gradients")
+"""Columns of `margins` that many readers do without."""
 JSON_COLUMNS = {
     "by_site",
     "binding",
@@ -324,10 +326,15 @@ class Store:
         return self._frame("hostings", order="role DESC, name")
 
     def margins(
-        self, role: str | None = None, hosting: str | Sequence[str] | None = None, gradients: bool = True
+        self,
+        role: str | None = None,
+        hosting: str | Sequence[str] | None = None,
+        leave: Collection[str] = (),
     ) -> pd.DataFrame:
-        """Every checked facility run; of hosting vectors of a role only, or of one vector or some. Without
-        its gradients, which take most of the time, where nobody reads them."""
+        """Every checked facility run; of hosting vectors of a role only, or of one vector or some.
+
+        The columns `leave` are left out: reading `gradients` and `diagnostics` takes most of the time.
+        """
         names = [hosting] if isinstance(hosting, str) else hosting
         conditions = {
             "hosting IN (SELECT name FROM hostings WHERE role = ?)": role,
@@ -339,7 +346,7 @@ class Store:
             f"WHERE {' AND '.join(given)}" if given else "",
             tuple(given.values()),
             order="hosting, period, fault, site, mode, beta",
-            leave=() if gradients else ("gradients",),
+            leave=leave,
         )
 
     def surrogates(self) -> pd.DataFrame:
