@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,27 @@ def test_unusable_tables(simulator: Simulator, waves: list, table: dict, message
         assert str(error.value) == message
     else:
         assert str(error.value).startswith("batch: 2 problems\n  beta = 9 is outside [")
+
+
+def test_cases_that_begin_alike_fail_alike_and_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Faults of one operating point share the voltage before them: beta V below d has no equilibrium."""
+    from dcvrt.integrators import simulator
+
+    looked: list[float] = []
+
+    def counted(eq: Any, u: Any, p: Any, *more: Any) -> Any:
+        looked.append(abs(complex(*u[:2])))
+        return equilibrium(eq, u, p, *more)
+
+    equilibrium = simulator.equilibrium
+    monkeypatch.setattr(simulator, "equilibrium", counted)
+    sim = Simulator(facility.gfl().compile(), save_at=2e-3)
+    sags = [Waveform.segments([(0.0, 0.95), (0.1, v), (0.2, 0.95)], until=0.4) for v in (0.6, 0.7, 0.8)]
+    low = Waveform.segments([(0.0, 0.93), (0.1, 0.6), (0.2, 0.93)], until=0.4)
+    found = sim.batch([*sags, low, sags[0]], {"beta": [1.0, 1.0, 1.0, 1.0, 1.3], "H": 1.0})
+    assert len(looked) == 2
+    assert len(set(found.status[:3])) == 1
+    assert found.status[0].startswith("gfl: no equilibrium")
+    assert found.status[3] != found.status[0]  # its residuals are others
+    assert found.status[4].startswith("completed")
+    assert list(found.started) == [False] * 4 + [True]
