@@ -60,7 +60,8 @@ class FleetStruct(Structure):
 
     _fields_ = (
         ("groups", c_long), ("group", POINTER(POINTER(GroupStruct))),
-        *((name, c_long) for name in ("ports", "points", "states", "directions", "lanes")),
+        *((name, c_long) for name in ("ports", "points", "states", "directions", "lanes", "feeds")),
+        ("feeding", LONGS),
     )  # fmt: skip
 
 

@@ -125,6 +125,6 @@ def table(
     filled = np.r_[port, point, np.zeros(-len(point) % BLOCK, dtype=np.int64)]
 
     def spread(m: Phasors) -> Phasors:
-        return np.where(real, m[np.ix_(filled, port)], 0.0)
+        return np.asarray(m[np.ix_(filled, port[real])])
 
     return NetworkTable(spread(z), [spread(d) if d.size else None for d in dz])

@@ -131,7 +131,7 @@ class NetworkTable:
 
     Parameters
     ----------
-    z : complex array (ports + points, ports)
+    z : complex array (ports + points, ports that feed a current)
         Rows of points are filled up to whole blocks.
     dz : sequence of such arrays or None, one a parameter
     """
@@ -183,7 +183,11 @@ class Fleet:
         self.x, self.xs = np.concatenate([*x, np.zeros(0)]), np.concatenate([*xs, np.zeros(0)])
         self._structs = structs
         self._table = (POINTER(GroupStruct) * max(len(structs), 1))(*(pointer(s) for s in structs))
-        self.struct = FleetStruct(len(structs), self._table, layout.ports, points, state, d, lanes)
+        feeding = np.flatnonzero(layout.unit_of_port()[1]).astype(c_long)
+        self.struct = FleetStruct(
+            len(structs), self._table, layout.ports, points, state, d, lanes,
+            len(feeding), self._held(feeding).ctypes.data_as(LONGS),
+        )  # fmt: skip
 
     def _held(self, array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         self._keep.append(array)

@@ -80,10 +80,12 @@ struct fleet {
     long groups;
     struct group *const *group;
     long ports, points, states, directions, lanes;
+    long feeds;          /* ports that feed a current: those of lanes with a unit */
+    const long *feeding; /* [feed] port */
 };
 
-/* One network: Z from ports to ports and points, and its derivatives. Blocks of eight rows:
- * [block][column][re, im][8]. */
+/* One network: Z from the ports that feed a current to ports and points, and its derivatives. Blocks of eight
+ * rows: [block][feed][re, im][8]. */
 struct network {
     const double *z;
     const double *const *dz; /* one for each direction, or null where Z does not depend on it */

@@ -57,9 +57,10 @@ static int stretch_run(struct run *r, const struct stretch *s)
         r->error_before = fmax(error, 1e-4);
         double next_h = (cut ? fmax(free_step, r->h) : r->h) * fmin(5.0, fmax(0.2, grow));
         next_h = fmin(next_h, REACH / fastest(r));
-        dense_step(r);
         double end = 1.0;
         int event = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]) > 0.0;
+        int sampled = next_sample < s->samples && s->sample[next_sample] < r->t + r->h;
+        if (event || sampled) dense_step(r);
         if (event && locate(r, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
         double until = end == 1.0 ? (cut ? limit : r->t + r->h) : r->t + end * r->h;
         for (; next_sample < s->samples && s->sample[next_sample] < until - SAME_INSTANT; next_sample++) {
@@ -118,7 +119,7 @@ static long count_memory(const struct run *r, long guards, long sensitive)
     long vectors = 4 * (r->n + r->ns) + (STAGES + 2) * (r->n + r->ns + (1 + r->d) * (2 * r->ports + r->size_v));
     long n = 2 * r->coupled;
     return vectors + DENSE * (r->n + r->ns) + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
-           4 * r->ports + r->d + 8 * 128; /* each vector begins on its own cache line */
+           4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * 128; /* each vector begins on its own cache line */
 }
 
 int fleet_run(const struct fleet *f, const struct options *o, long stretches, const struct stretch *s, double *x,
@@ -140,13 +141,16 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     memset(r.memory, 0, total * sizeof(double));
     r.pivot = malloc((2 * r.coupled + 1) * sizeof(long));
     r.coupled_port = malloc((r.coupled + 1) * sizeof(long));
-    if (!r.pivot || !r.coupled_port) {
-        free(r.memory), free(r.pivot), free(r.coupled_port);
+    r.feed_of_port = malloc((r.ports + 1) * sizeof(long));
+    if (!r.pivot || !r.coupled_port || !r.feed_of_port) {
+        free(r.memory), free(r.pivot), free(r.coupled_port), free(r.feed_of_port);
         return NO_MEMORY;
     }
     for (long g = 0, k = 0; g < f->groups; g++)
         for (long i = 0; f->group[g]->reads_v && i < f->group[g]->packs * f->lanes; i++)
             r.coupled_port[k++] = f->group[g]->first_port + i;
+    for (long p = 0; p < r.ports; p++) r.feed_of_port[p] = -1;
+    for (long j = 0; j < f->feeds; j++) r.feed_of_port[f->feeding[j]] = j;
     double *at = r.memory;
     struct state *states[] = {&r.now, &r.next, &r.stage, &r.inside};
     for (int k = 0; k < 4; k++) states[k]->x = take(&at, r.n), states[k]->xs = take(&at, r.d ? r.ns : 0);
@@ -159,7 +163,7 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     r.guard = take(&at, guards + 8), r.guards = take(&at, (guards + 8) * sensitive);
     r.by_v = take(&at, 4 * r.coupled), r.matrix = take(&at, 4 * r.coupled * r.coupled);
     r.right = take(&at, 2 * r.coupled), r.trial = take(&at, r.size_v), r.pack = take(&at, 4 * r.ports);
-    r.scale = take(&at, r.d);
+    r.scale = take(&at, r.d), r.fed = take(&at, 8 * f->feeds);
     memcpy(r.now.x, x, r.n * sizeof(double));
     if (r.d) memcpy(r.now.xs, xs, r.ns * sizeof(double));
     for (long p = 0; p < r.ports; p++) {
@@ -188,6 +192,6 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     }
     memcpy(x, r.now.x, r.n * sizeof(double));
     if (r.d) memcpy(xs, r.now.xs, r.ns * sizeof(double));
-    free(r.memory), free(r.pivot), free(r.coupled_port);
+    free(r.memory), free(r.pivot), free(r.coupled_port), free(r.feed_of_port);
     return status;
 }

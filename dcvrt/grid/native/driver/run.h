@@ -35,8 +35,10 @@ struct run {
     double *dense, *denses;  /* [DENSE][n], [DENSE][ns] */
     double *guard, *guards;  /* of one pack */
     double *by_v, *matrix, *right, *trial, *pack;
+    double *fed;             /* [feed][direction][re, im]: source currents as a product takes them */
     long *pivot, coupled;    /* ports whose source reads their voltage */
     long *coupled_port;
+    long *feed_of_port;      /* number among the ports that feed, or -1 */
     int factored;
     double *scale;           /* of the derivatives, per direction */
     double dt[MOST_DIRECTIONS]; /* derivative of the present instant, where known */

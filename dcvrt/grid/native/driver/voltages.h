@@ -10,41 +10,61 @@ enum { NEWTON = 30 };
 
 /* -- linear algebra -------------------------------------------------------------------------------------- */
 
-/* Rows [from, to) of Z times several columns; from and to are multiples of BLOCK. */
-static inline __attribute__((always_inline)) void product(const struct run *r, const double *z, int count,
-                                                          const double *s, long stride_s, double *v,
-                                                          long stride_v, long from, long to, int add)
+/* Rows [from, to) of Z times `count` columns of `fed`, `wide` blocks of rows at a time: a sum waits for the one
+ * before it, so that several must be under way. */
+static inline __attribute__((always_inline)) long product(const struct run *r, const double *z, int count, int wide,
+                                                          double *v, long stride_v, long from, long to, int add)
 {
-    long columns = r->ports;
-    for (long row = from; row < to; row += BLOCK) {
-        const double *at = z + (row / BLOCK) * columns * 2 * BLOCK;
-        block re[8], im[8];
-        for (int k = 0; k < count; k++) re[k] = im[k] = (block){0};
-        for (long j = 0; j < columns; j++, at += 2 * BLOCK) {
-            block zr = *(const block *)at, zi = *(const block *)(at + BLOCK);
-            for (int k = 0; k < count; k++) {
-                double a = s[k * stride_s + j], b = s[k * stride_s + columns + j];
-                re[k] += zr * a - zi * b;
-                im[k] += zr * b + zi * a;
+    long feeds = r->fleet->feeds, each = feeds * 2 * BLOCK;
+    long row = from;
+    for (; row + wide * BLOCK <= to; row += wide * BLOCK) {
+        const double *at = z + (row / BLOCK) * each, *fed = r->fed;
+        block re[12], im[12];
+        for (int k = 0; k < wide * count; k++) re[k] = im[k] = (block){0};
+        for (long j = 0; j < feeds; j++, at += 2 * BLOCK, fed += 2 * count)
+            for (int w = 0; w < wide; w++) {
+                block zr = *(const block *)(at + w * each), zi = *(const block *)(at + w * each + BLOCK);
+                for (int k = 0; k < count; k++) {
+                    int e = w * count + k;
+                    re[e] += zr * fed[2 * k], im[e] += zr * fed[2 * k + 1];
+                    re[e] -= zi * fed[2 * k + 1], im[e] += zi * fed[2 * k];
+                }
             }
-        }
-        for (int k = 0; k < count; k++) {
-            block *vr = (block *)(v + k * stride_v + row), *vi = (block *)(v + k * stride_v + r->rows + row);
-            if (add) *vr += re[k], *vi += im[k];
-            else *vr = re[k], *vi = im[k];
-        }
+        for (int w = 0; w < wide; w++)
+            for (int k = 0; k < count; k++) {
+                double *vr = v + k * stride_v + row + w * BLOCK;
+                block *real = (block *)vr, *imaginary = (block *)(vr + r->rows);
+                int e = w * count + k;
+                if (add) *real += re[e], *imaginary += im[e];
+                else *real = re[e], *imaginary = im[e];
+            }
     }
+    return row;
 }
 
-static void products(const struct run *r, const double *z, long count, const double *s, long stride_s, double *v,
+/* Rows [from, to) of Z times several sets of source currents; from and to are multiples of BLOCK. */
+static void products(struct run *r, const double *z, long count, const double *s, long stride_s, double *v,
                      long stride_v, long from, long to, int add)
 {
-    for (; count > 0; count -= 4, s += 4 * stride_s, v += 4 * stride_v) switch (count) {
-        case 1: product(r, z, 1, s, stride_s, v, stride_v, from, to, add); break;
-        case 2: product(r, z, 2, s, stride_s, v, stride_v, from, to, add); break;
-        case 3: product(r, z, 3, s, stride_s, v, stride_v, from, to, add); break;
-        default: product(r, z, 4, s, stride_s, v, stride_v, from, to, add);
+    const struct fleet *f = r->fleet;
+    for (long now; count > 0; count -= now, s += now * stride_s, v += now * stride_v) {
+        now = count < 4 ? count : 4;
+        for (long j = 0; j < f->feeds; j++)
+            for (long k = 0; k < now; k++) {
+                r->fed[2 * (j * now + k)] = s[k * stride_s + f->feeding[j]];
+                r->fed[2 * (j * now + k) + 1] = s[k * stride_s + r->ports + f->feeding[j]];
+            }
+        long row = from;
+        switch (now) {
+        case 1:
+            row = product(r, z, 1, 3, v, stride_v, row, to, add);
+            product(r, z, 1, 1, v, stride_v, row, to, add);
+            break;
+        case 2: product(r, z, 2, 1, v, stride_v, row, to, add); break;
+        case 3: product(r, z, 3, 1, v, stride_v, row, to, add); break;
+        default: product(r, z, 4, 1, v, stride_v, row, to, add);
         }
+    }
 }
 
 /* LU factors with row pivots, in place; 0 where the matrix is singular. */
@@ -88,9 +108,12 @@ static void back(const double *a, long n, const long *pivot, double *b)
 
 /* -- the network ----------------------------------------------------------------------------------------- */
 
-static double z_entry(const struct run *r, long row, long column, int part)
+/* Re or im of Z from a port to a row; ports without a unit feed nothing. */
+static double z_entry(const struct run *r, long row, long port, int part)
 {
-    return r->network->z[((row / BLOCK) * r->ports + column) * 2 * BLOCK + part * BLOCK + row % BLOCK];
+    long feed = r->feed_of_port[port];
+    if (feed < 0) return 0.0;
+    return r->network->z[((row / BLOCK) * r->fleet->feeds + feed) * 2 * BLOCK + part * BLOCK + row % BLOCK];
 }
 
 /* Slopes ds/dv of all coupled ports at these voltages: [port][2][2]. */
