@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -16,6 +16,12 @@ from dcvrt.errors import ModelError, did_you_mean
 
 SCALE = "scale"
 Floats = npt.NDArray[np.float64]
+
+
+@lru_cache(maxsize=256)
+def _for_many(function: ca.Function, n: int) -> ca.Function:
+    """A function of one unit for n of them: CasADi makes it anew in every call of `map`."""
+    return function.map(n)
 
 
 def for_units(function: ca.Function, *values: Floats) -> list[Floats]:
@@ -37,7 +43,7 @@ def for_units(function: ca.Function, *values: Floats) -> list[Floats]:
     found = [np.empty((n, columns, rows)) for rows, columns in shapes]
     # numbers pass through memory: matrices of CasADi are made of them one by one
     buffer: Any  # its stubs take memory of integers
-    buffer, run = function.map(n).buffer()
+    buffer, run = _for_many(function, n).buffer()
     for k, array in enumerate(given):
         buffer.set_arg(k, array.reshape(-1).data)
     for k, array in enumerate(found):
