@@ -106,7 +106,7 @@ def test_the_default_tolerance_keeps_voltages_and_events(grid: Grid, name: str) 
     """Facilities are allowed three times the error of machines, and step at the edge of stability."""
     coupled = dict.fromkeys(NO_VRT, facility.get(name).compile())
     point = grid.native.point(NO_VRT, Period(), (), coupled, {"beta": 1.3})
-    for fault in (BusFault(22), BusFault(103)):
+    for fault in (BusFault(22), BusFault(103), BusFault(17)):
         stages = fault.stages(grid.network)
         times = sample_times(stages, 3.0, 1 / 120)
         coarse, fine = (point.simulate(stages, times, o) for o in (Options(), TIGHT))

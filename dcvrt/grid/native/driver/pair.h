@@ -9,12 +9,17 @@
  *
  * Dense output of order 4: the cubic of Hermite with s^2 (1 - s)^2 h sum LAST_TERM k, one of a family that all
  * conditions of order 4 leave free; its last entry is the round number next to the least error of order 5 (2.04).
+ *
+ * Where limits of facilities are smoothed over less than a step, their corner may lie between the stages, and a step
+ * or a sample inside it errs by a multiple of the estimate. The last term of the dense output sees it: what it is
+ * above SMOOTH tolerance^(-1/5) tolerances counts as error, as in the kernel of single facilities.
  */
 #ifndef DCVRT_PAIR_H
 #define DCVRT_PAIR_H
 
 enum { STAGES = 7, DENSE = 5 };
 #define REACH 5.3
+#define SMOOTH 24.0
 
 static const double NODE[STAGES] = {0.0, 2. / 9, 1. / 3, 5. / 9, 2. / 3, 1.0, 1.0};
 static const double A[STAGES][STAGES - 1] = {

@@ -38,26 +38,31 @@ static inline double larger(double a, double b)
     return a > b ? a : b;
 }
 
-static inline double over_of(const struct run *r, long i)
+/* Error of a step in one state over its tolerance; `corner` is the part of an error that the last term is. */
+static inline double over_of(const struct run *r, double corner, long i)
 {
     const struct options *o = r->options;
-    double e = ERROR[0] * r->k[0].f[i];
-    for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].f[i];
-    return fabs(r->h * e) / (o->atol + o->rtol * larger(r->now.x[i], r->next.x[i]));
+    double e = ERROR[0] * r->k[0].f[i], last = LAST_TERM[0] * r->k[0].f[i];
+    for (int j = 2; j < STAGES; j++) e += ERROR[j] * r->k[j].f[i], last += LAST_TERM[j] * r->k[j].f[i];
+    return r->h * larger(e, corner * last) / (o->atol + o->rtol * larger(r->now.x[i], r->next.x[i]));
 }
 
 /* Largest error of a step, in states [from, to), over its tolerance; no number where one is none. */
 static double error_in(const struct run *r, long from, long to)
 {
     double most[BLOCK] = {0}, sum[BLOCK] = {0}, worst = 0.0, all = 0.0;
+    double corner = pow(r->options->rtol, 0.2) / SMOOTH;
     long i = from;
     for (; i + BLOCK <= to; i += BLOCK)
         for (int l = 0; l < BLOCK; l++) {
-            double over = over_of(r, i + l);
+            double over = over_of(r, corner, i + l);
             most[l] = over > most[l] ? over : most[l];
             sum[l] += over;
         }
-    for (; i < to; i++) sum[i % BLOCK] += over_of(r, i), most[i % BLOCK] = larger(most[i % BLOCK], over_of(r, i));
+    for (; i < to; i++) {
+        double over = over_of(r, corner, i);
+        sum[i % BLOCK] += over, most[i % BLOCK] = larger(most[i % BLOCK], over);
+    }
     for (int l = 0; l < BLOCK; l++) worst = larger(worst, most[l]), all += sum[l];
     return isfinite(all) ? worst : NAN;
 }
