@@ -111,7 +111,7 @@ class OperatingPoint:
         else:
             total, surplus = float(p_set.sum()) + more, np.inf
             while abs(surplus) > SLACK_TOLERANCE:  # contracts: the losses change by a small part of the load
-                p = redispatch.share(p_set, p_max, total)
+                p = redispatch.share(p_set, p_max, total, float(system.config.mva), self.where)
                 system.PV.p0.v[:] = p[: system.PV.n]
                 self._solve()
                 surplus = float(slack.p.v.sum() - p[system.PV.n :].sum())

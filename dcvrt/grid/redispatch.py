@@ -19,7 +19,9 @@ def check_rule(rule: str) -> None:
         raise InputError(f"redispatch = {rule!r} is not known.{did_you_mean(rule, RULES)}")
 
 
-def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
+def share(
+    p_set: Floats, p_max: Floats, total: float, base_mva: float = 1.0, where: str = "redispatch"
+) -> Floats:
     r"""Output of each unit when all units follow the total in proportion to their schedule.
 
     .. math:: p_k = \min(p_k^{max}, \kappa\, p_k^{set}), \qquad \sum_k p_k = p_{total}
@@ -30,9 +32,12 @@ def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
     Parameters
     ----------
     p_set, p_max : array (units,)
-        Schedule and upper limit, in any one unit of power.
+        Schedule and upper limit, pu on `base_mva`; MW when it is not given.
     total : float
         What they must generate together.
+    base_mva : float
+    where : str
+        What messages call the operating point.
 
     Raises
     ------
@@ -55,8 +60,9 @@ def share(p_set: Floats, p_max: Floats, total: float) -> Floats:
             else "host less, lower load_scale or raise p_max of some unit."
         )
         raise InfeasibleError(
-            f"redispatch: the {int(follows.sum())} units that follow the load can generate 0 to "
-            f"{ceiling.sum():g} together, {total:g} is needed. Way out: {way_out}"
+            f"{where}: the {int(follows.sum())} units that follow the load can generate 0 to "
+            f"{base_mva * ceiling.sum():.5g} MW together, {base_mva * total:.5g} MW are needed. "
+            f"Way out: {way_out}"
         )
     p, at_limit = np.zeros_like(weight), np.zeros(len(weight), dtype=bool)
     while True:

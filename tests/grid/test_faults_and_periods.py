@@ -99,13 +99,13 @@ def test_redispatch_returns_the_schedule_for_the_scheduled_total() -> None:
     [
         (
             9.0,
-            "redispatch: the 2 units that follow the load can generate 0 to 8.7 together, 9 is needed. "
-            "Way out: host less, lower load_scale or raise p_max of some unit.",
+            "redispatch: the 2 units that follow the load can generate 0 to 8.7 MW together, 9 MW are "
+            "needed. Way out: host less, lower load_scale or raise p_max of some unit.",
         ),
         (
             -0.5,
-            "redispatch: the 2 units that follow the load can generate 0 to 8.7 together, -0.5 is needed. "
-            "Way out: more wind than load and losses: lower the wind or raise load_scale.",
+            "redispatch: the 2 units that follow the load can generate 0 to 8.7 MW together, -0.5 MW are "
+            "needed. Way out: more wind than load and losses: lower the wind or raise load_scale.",
         ),
     ],
 )

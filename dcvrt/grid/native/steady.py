@@ -272,6 +272,7 @@ class Flow:
         first = total = float(p_set.sum() + load.real.sum() - network.p_load.sum() / base)
         angle, size = np.angle(start), abs(start)
         n, m = len(equations.free), len(equations.pq)
+        nearest, worst = np.inf, 0
         for step in range(STEPS + 1):
             p, weight = _dispatch(p_set, p_max, at == slack, total, rule)
             scheduled, share = 1j * q_fixed - load, np.zeros(len(load))
@@ -281,6 +282,8 @@ class Flow:
             current = y @ v
             rest = equations.mismatch(v, current, scheduled)
             level = abs(rest).max()
+            if step and level < nearest:
+                nearest, worst = level, int(abs(rest).argmax())
             if step and (level < TOLERANCE or not np.isfinite(level) or step == STEPS):
                 break
             try:
@@ -292,15 +295,13 @@ class Flow:
             size[equations.pq] -= move[n : n + m]
             total -= float(move[-1])
         if rule != "slack":  # raises where the units cannot supply it; a step of the search may go beyond
-            redispatch.share(p_set, p_max, total if level < ACCEPTED else first)
+            redispatch.share(p_set, p_max, total if level < ACCEPTED else first, base, where)
         if not level < ACCEPTED:
-            worst = int(np.argmax(np.nan_to_num(abs(rest), nan=np.inf)))
             raise SimulationError(
-                f"{where}: power flow has no solution; the largest mismatch, {level * base:.3g} MVA, "
-                "is at bus "
-                f"{network.bus[equations.bus_of(worst)]}. Way out: host less there, or check "
-                "load_scale and the "
-                "voltage set points."
+                f"{where}: power flow has no solution; where Newton's method came nearest to one, the "
+                f"largest mismatch, {nearest * base:.3g} MVA, is at bus "
+                f"{network.bus[equations.bus_of(worst)]}. Way out: host less there, or check load_scale and "
+                "the voltage set points."
             )
         let_go = self.holding[limited != 0]
         return Steady(
