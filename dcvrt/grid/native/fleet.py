@@ -182,7 +182,7 @@ class Group:
             for k in np.flatnonzero((guards[:, r] > -AT_REST) & (beyond[:, r] > AT_REST)).tolist():
                 text = f"{self.units[k].name} at bus {self.units[k].bus}: {automata[a].path}, {row.text}"
                 if beyond[k, r] > ON_LIMIT:
-                    broken.append(text)
+                    broken.append(f"{text} by {beyond[k, r]:.3g} pu")
                 else:
                     notes.append(f"{text} by {beyond[k, r]:.1g} pu")
         states = self.structure.dae.states

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from benchmarks._trapezoid import Stepper
 from dcvrt.grid import BusFault, Grid, Period, andes
 from dcvrt.grid.fault_run import FaultRun
+from dcvrt.grid.native.engine import sample_times
 from dcvrt.grid.native.steady import Flow, loads
 from dcvrt.grid.network import Network
 from tests.grid.native.cases import NO_VRT, TIGHT, TIGHTEST, WINDY, away, case, package, run
@@ -103,6 +106,34 @@ def test_twelve_faults_of_the_large_case(grid: Grid) -> None:
             inside = w.t[once[0]] < fault.cleared_at
             assert error[inside].max() < 1e-4, fault.bus
             assert error.max() < 1e-3, fault.bus
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bus", [23, 78, 103])
+def test_by_the_same_rule_the_equations_are_those_of_andes(grid: Grid, bus: int) -> None:
+    """Both stepped by the trapezoidal rule at 1/120 s, limits included: no error of a step is left."""
+    fault, until = BusFault(bus), 0.5
+    theirs = grid.waveforms_of(NO_VRT, None, [fault], until, engine="andes")[fault].require().waveforms
+    stages = fault.stages(grid.network)
+    stepper = Stepper(grid.native.point(NO_VRT, Period()))
+    v = stepper.run(stages, sample_times(stages, until, 1 / 120))
+    for k, site in enumerate(grid.sites):
+        assert np.abs(abs(v[:, k]) - abs(theirs[site].v)).max() < 5e-7, site
+
+
+@pytest.mark.slow
+def test_the_trapezoidal_rule_tends_to_the_engine(grid: Grid) -> None:
+    """Its error falls with the square of the step, towards what the engine gives."""
+    fault, errors_ = BusFault(103), []
+    stages = fault.stages(grid.network)
+    for step in (1 / 120, 1 / 240, 1 / 480):
+        times = sample_times(stages, 0.2, step)
+        point = grid.native.point(NO_VRT, Period())
+        difference = Stepper(point).run(stages, times) - point.simulate(stages, times, TIGHT).v
+        errors_.append(float(np.abs(difference).max()))
+    assert errors_[0] > 1e-4
+    for coarse, fine in pairwise(errors_):
+        assert coarse / fine == pytest.approx(4.0, rel=0.1)
 
 
 @pytest.mark.slow
