@@ -169,6 +169,22 @@ static int jump(struct run *r, long g, long row, long pack, long lane)
     return COMPLETED;
 }
 
+/* Time of the next timer that runs out. */
+static double next_timer(const struct run *r)
+{
+    const struct fleet *f = r->fleet;
+    double next = INFINITY;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        long count = group->packs * group->rows * f->lanes;
+        for (long k = 0; k < count; k++) {
+            double due = group->since[k] + group->held[k];
+            if (due < next) next = due;
+        }
+    }
+    return next;
+}
+
 /* Everything that is due at r->t: rows that fire, timers that start or lapse. Where r->dt is not known, the instant
  * is that of a located crossing. */
 static int settle(struct run *r)
@@ -223,31 +239,18 @@ static int settle(struct run *r)
                     }
             }
         }
-        if (!fired) return COMPLETED;
-    }
-}
-
-/* Time of the next timer that runs out. */
-static double next_timer(const struct run *r)
-{
-    const struct fleet *f = r->fleet;
-    double next = INFINITY;
-    for (long g = 0; g < f->groups; g++) {
-        const struct group *group = f->group[g];
-        long count = group->packs * group->rows * f->lanes;
-        for (long k = 0; k < count; k++) {
-            double due = group->since[k] + group->held[k];
-            if (due < next) next = due;
+        if (!fired) {
+            r->timer = next_timer(r);
+            return COMPLETED;
         }
     }
-    return next;
 }
 
-/* Whether a timer that runs has lost its guard at the end of the step. */
-static int lapses(struct run *r, double t, const struct state *x, const struct moment *m)
+/* Stops the timers that have lost their guard at the end of the step. */
+static void lapses(struct run *r, double t, const struct state *x, const struct moment *m)
 {
     const struct fleet *f = r->fleet;
-    int any = 0;
+    if (!isfinite(r->timer)) return;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
         long count = group->packs * group->rows * f->lanes;
@@ -258,11 +261,11 @@ static int lapses(struct run *r, double t, const struct state *x, const struct m
             const double *value = guards_of(r, group, pack, t, x, m);
             for (long k = 0; k < group->rows * f->lanes; k++) {
                 double *since = &group->since[pack * group->rows * f->lanes + k];
-                if (isfinite(*since) && value[k] <= 0.0) *since = INFINITY, any = 1;
+                if (isfinite(*since) && value[k] <= 0.0) *since = INFINITY;
             }
         }
     }
-    return any;
+    r->timer = next_timer(r);
 }
 
 /* Which rotor is further from the centre of inertia than allowed; -1 where none is. */

@@ -38,7 +38,7 @@ static int stretch_run(struct run *r, const struct stretch *s)
     }
     while (r->t < s->to - SAME_INSTANT) {
         if (r->record->steps + r->record->rejected >= o->max_steps) return failed(r, TOO_MANY_STEPS, r->t, 0, 0, 0, 0);
-        double limit = fmin(s->to, next_timer(r));
+        double limit = fmin(s->to, r->timer);
         double free_step = r->h;
         int cut = 0;
         if (r->h > o->longest) r->h = free_step = o->longest;
@@ -59,8 +59,6 @@ static int stretch_run(struct run *r, const struct stretch *s)
         next_h = fmin(next_h, REACH / fastest(r));
         double end = 1.0;
         int event = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]) > 0.0;
-        int sampled = next_sample < s->samples && s->sample[next_sample] < r->t + r->h;
-        if (event || sampled) dense_step(r);
         if (event && locate(r, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
         double until = end == 1.0 ? (cut ? limit : r->t + r->h) : r->t + end * r->h;
         for (; next_sample < s->samples && s->sample[next_sample] < until - SAME_INSTANT; next_sample++) {
@@ -85,7 +83,7 @@ static int stretch_run(struct run *r, const struct stretch *s)
         }
         r->t = until;
         if (!event) lapses(r, r->t, &r->now, &r->k[0]);
-        if (r->t >= next_timer(r) - SAME_INSTANT) restart = 1;
+        if (r->t >= r->timer - SAME_INSTANT) restart = 1;
         if (restart) {
             if (r->coupled) memcpy(r->here.v, r->k[0].v, r->size_v * sizeof(double));
             r->dt_known = 0;
@@ -118,7 +116,7 @@ static long count_memory(const struct run *r, long guards, long sensitive)
 {
     long vectors = 4 * (r->n + r->ns) + (STAGES + 2) * (r->n + r->ns + (1 + r->d) * (2 * r->ports + r->size_v));
     long n = 2 * r->coupled;
-    return vectors + DENSE * (r->n + r->ns) + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
+    return vectors + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
            4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * 128; /* each vector begins on its own cache line */
 }
 
@@ -159,7 +157,6 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
         m->f = take(&at, r.n), m->fs = take(&at, r.ns), m->s = take(&at, 2 * r.ports);
         m->ss = take(&at, r.d * 2 * r.ports), m->v = take(&at, r.size_v), m->vs = take(&at, r.d * r.size_v);
     }
-    r.dense = take(&at, DENSE * r.n), r.denses = take(&at, DENSE * r.ns);
     r.guard = take(&at, guards + 8), r.guards = take(&at, (guards + 8) * sensitive);
     r.by_v = take(&at, 4 * r.coupled), r.matrix = take(&at, 4 * r.coupled * r.coupled);
     r.right = take(&at, 2 * r.coupled), r.trial = take(&at, r.size_v), r.pack = take(&at, 4 * r.ports);

@@ -17,7 +17,7 @@
 #ifndef DCVRT_PAIR_H
 #define DCVRT_PAIR_H
 
-enum { STAGES = 7, DENSE = 5 };
+enum { STAGES = 7 };
 #define REACH 5.3
 #define SMOOTH 24.0
 

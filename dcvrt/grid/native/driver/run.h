@@ -30,9 +30,9 @@ struct run {
     long n, ns, ports, points, rows, d; /* states, their derivatives, ports, points, rows of Z, directions */
     long size_v;                        /* numbers of one set of voltages: 2 (ports + points) */
     double t, h, error_before;
+    double timer;            /* when the next timer runs out */
     struct state now, next, stage, inside;
     struct moment k[STAGES], here, there;
-    double *dense, *denses;  /* [DENSE][n], [DENSE][ns] */
     double *guard, *guards;  /* of one pack */
     double *by_v, *matrix, *right, *trial, *pack;
     double *fed;             /* [feed][direction][re, im]: source currents as a product takes them */

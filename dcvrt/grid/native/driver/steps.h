@@ -130,39 +130,35 @@ static double fastest(const struct run *r)
     return sqrt(most);
 }
 
-static void dense_of(const struct run *r, long n, const double *x, const double *x1, double *const *k, double *c)
+/* Weights of the stages at a share s of the step: the cubic of Hermite and the last term. */
+static void dense_weights(double s, double *w)
 {
-    for (long i = 0; i < n; i++) {
-        double sum = LAST_TERM[0] * k[0][i];
-        for (int j = 2; j < STAGES; j++) sum += LAST_TERM[j] * k[j][i];
-        double change = x1[i] - x[i], bend = r->h * k[0][i] - change;
-        c[i] = x[i];
-        c[n + i] = change;
-        c[2 * n + i] = bend;
-        c[3 * n + i] = change - r->h * k[STAGES - 1][i] - bend;
-        c[4 * n + i] = r->h * sum;
+    const double *b = A[STAGES - 1];
+    double u = 1.0 - s;
+    for (int j = 0; j < STAGES; j++) {
+        double end = j < STAGES - 1 ? b[j] : 0.0, bend = (j == 0) - end;
+        w[j] = s * (end + u * (bend + s * (end - (j == STAGES - 1) - bend + u * LAST_TERM[j])));
     }
 }
 
-static void dense_step(struct run *r)
+static void dense_at(long n, const double *restrict x, double h, const double *w, double *const *k,
+                     double *restrict into)
 {
-    double *k[STAGES], *ks[STAGES];
-    for (int j = 0; j < STAGES; j++) k[j] = r->k[j].f, ks[j] = r->k[j].fs;
-    dense_of(r, r->n, r->now.x, r->next.x, k, r->dense);
-    dense_of(r, r->ns, r->now.xs, r->next.xs, ks, r->denses);
+    for (long i = 0; i < n; i++) {
+        double sum = w[0] * k[0][i];
+        for (int j = 2; j < STAGES; j++) sum += w[j] * k[j][i];
+        into[i] = x[i] + h * sum;
+    }
 }
 
-static void dense_at(long n, const double *restrict c, double s, double *restrict x)
-{
-    double u = 1.0 - s;
-    for (long i = 0; i < n; i++)
-        x[i] = c[i] + s * (c[n + i] + u * (c[2 * n + i] + s * (c[3 * n + i] + u * c[4 * n + i])));
-}
-
+/* States at a share s of the last step, into r->inside. */
 static void inside_at(struct run *r, double s)
 {
-    dense_at(r->n, r->dense, s, r->inside.x);
-    dense_at(r->ns, r->denses, s, r->inside.xs);
+    double w[STAGES], *k[STAGES], *ks[STAGES];
+    for (int j = 0; j < STAGES; j++) k[j] = r->k[j].f, ks[j] = r->k[j].fs;
+    dense_weights(s, w);
+    dense_at(r->n, r->now.x, r->h, w, k, r->inside.x);
+    dense_at(r->ns, r->now.xs, r->h, w, ks, r->inside.xs);
 }
 
 #endif
