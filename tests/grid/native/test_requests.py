@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -218,11 +219,16 @@ def test_a_unit_that_starts_outside_a_limit_is_named(tmp_path: Path) -> None:
     (tmp_path / "small.raw").write_text(path.read_text())
     narrow = " ".join([*fields[:5], "0.31", *fields[6:]])  # V_max
     (tmp_path / "small.dyr").write_text(text.replace(line, narrow))
-    with pytest.raises(SimulationError) as failure:
-        Grid.from_case(tmp_path / "small.raw", sites=(9,)).waveforms({9: 10.0}, BusFault(4))
-    text = str(failure.value)
-    assert text.startswith("small, base: 1 limit(s) are exceeded before the fault: ")
-    assert "at bus 1: governor" in text
+    narrowed = Grid.from_case(tmp_path / "small.raw", sites=(9,))
+    texts = []
+    for by in ("native", "andes"):
+        with pytest.raises(SimulationError) as failure:
+            narrowed.waveforms({9: 10.0}, BusFault(4), engine=by)
+        texts.append(str(failure.value))
+        assert texts[-1].startswith("small, base: 1 limit(s) are exceeded before the fault: ")
+    assert "at bus 1: governor" in texts[0]
+    beyond, needed = (float(re.search(r"([\d.]+) pu(?: is needed)?\. ", text)[1]) for text in texts)
+    assert 0.31 + beyond == pytest.approx(needed, abs=1e-3)
 
 
 def test_a_facility_that_cannot_run_in_the_period_is_named() -> None:
