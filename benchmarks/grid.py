@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks._trapezoid import Stepper
-from benchmarks.harness import Result, least, result
+from benchmarks.harness import Result, least, least_in_turn, result
 from dcvrt import Simulator, facility
 from dcvrt.criteria import Criteria
 from dcvrt.dae import Dae
@@ -263,9 +263,14 @@ def _one_closed_loop(grid: Grid, mode: str, count: int, until: float, budget: fl
     simulator, coupled = Simulator(dae), dict.fromkeys(SITES, dae)
     faults = [BusFault(bus) for bus in FAULTS[:count]]
     found = _waveforms(grid, faults, until, None)
-    open_loop = least(lambda: _waveforms(grid, faults, until, None), budget)
-    closed = least(lambda: _waveforms(grid, faults, until, coupled), budget)
-    runs = least(lambda: _facility_runs(simulator, found, grid.pf), budget)
+    open_loop, closed, runs = least_in_turn(
+        [
+            lambda: _waveforms(grid, faults, until, None),
+            lambda: _waveforms(grid, faults, until, coupled),
+            lambda: _facility_runs(simulator, found, grid.pf),
+        ],
+        budget,
+    )
     case = f"closed loop, 4 {mode}, {count} fault(s), {until:g} s"
     with_runs = "of the open loop's with its facility runs"
     return [
