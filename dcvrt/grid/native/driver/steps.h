@@ -111,7 +111,7 @@ static double error_of(struct run *r)
 static double fastest(const struct run *r)
 {
     const struct fleet *f = r->fleet;
-    double most = 0.0;
+    double most = 0.0, still = STILL * r->options->atol;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
         for (long pack = 0; pack < group->packs; pack++) {
@@ -124,7 +124,7 @@ static double fastest(const struct run *r)
                     rate[l] += df * df, state[l] += dx * dx;
                 }
             for (long l = 0; l < f->lanes; l++)
-                if (state[l] > 1e-24 && rate[l] > most * state[l]) most = rate[l] / state[l];
+                if (state[l] > still * still && rate[l] > most * state[l]) most = rate[l] / state[l];
         }
     }
     return sqrt(most);
