@@ -12,6 +12,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from dcvrt.errors import SimulationError
+from dcvrt.grid.chord import TOLERANCE, Chord
 from dcvrt.grid.network import Network
 from dcvrt.grid.steering import Steering
 from dcvrt.grid.switching import LOOKS, Limited, reactive_limits_at, switched
@@ -20,10 +21,6 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Phasors = npt.NDArray[np.complex128]
 
-TOLERANCE = 1e-9
-"""Largest power mismatch of a solution, pu on the system base."""
-CLOSE = 1e-4
-"""Mismatch below which hours of a batch are looked at for buses that switch, pu."""
 LEVEL = 0.02
 """Hours whose load lies within so much of the reference load share one Jacobian."""
 MOST_LEVELS = 60
@@ -102,6 +99,21 @@ class HourlySolution:
             self.limited[:, at],
         )
 
+    def unsolved(self) -> HourlySolution:
+        """A copy to start from elsewhere, in which no hour counts as solved."""
+        copies = (
+            self.v.copy(),
+            np.zeros_like(self.converged),
+            self.mismatch_mva.copy(),
+            self.worst_bus.copy(),
+        )
+        return HourlySolution(*copies, self.hours, self.limited.copy())
+
+    def update(self, at: Integers, solved: HourlySolution) -> None:
+        """Take over the solution of the hours at some places."""
+        self.v[:, at], self.limited[:, at], self.converged[at] = solved.v, solved.limited, solved.converged
+        self.mismatch_mva[at], self.worst_bus[at] = solved.mismatch_mva, solved.worst_bus
+
     def require(self) -> HourlySolution:
         """Return itself, or raise `SimulationError` with `status` when an hour has no solution."""
         if not self.converged.all():
@@ -138,16 +150,19 @@ class PowerFlow:
         self.network, self.reactive_limits = network, reactive_limits
         kind = np.array(network.kind)
         self.pq = np.flatnonzero(kind == "pq")
-        self.pv = np.flatnonzero(kind != "pq") if reactive_limits else np.zeros(0, dtype=np.int64)
+        holding = np.r_[np.flatnonzero(kind == "pv"), np.flatnonzero(kind == "slack")]
+        self.pv = np.sort(holding) if reactive_limits else np.zeros(0, dtype=np.int64)
         """Buses whose units hold the voltage and may let it go, the slack bus among them; none without
         `reactive_limits`."""
-        self.free = np.r_[np.flatnonzero(kind == "pv"), self.pq]
-        """Buses whose angle is unknown: `pv`, then `pq`."""
+        self.free = np.r_[self.pq, holding[:-1]]
+        """Buses whose angle is unknown: `pq`, then `pv`."""
         self.moving = np.r_[self.pq, self.pv]
         """Buses whose voltage can move."""
         self._y = network.admittance()
         self.q_low, self.q_high = reactive_limits_at(network, self.pv)
         self.held = network.v_set[self.pv]
+        order = np.r_[self.pq, holding]
+        self._chord = Chord(self._y, order, len(self.pq), self.pv, self.q_low, self.q_high, self.held)
         self._steerings: dict[int, Steering] = {}
 
     @cached_property
@@ -312,7 +327,7 @@ class PowerFlow:
         s = injection / self.network.base_mva
         v = np.empty(s.shape, dtype=complex)
         rest = np.full(s.shape[1], np.inf)
-        row = np.zeros(s.shape[1], dtype=np.int64)
+        bus = np.zeros(s.shape[1], dtype=np.int64)
         at = np.zeros((len(self.pv), s.shape[1]), dtype=np.int8)
         for level, group in self._levels(s):
             if start is None:
@@ -323,19 +338,19 @@ class PowerFlow:
             else:
                 begin = start[:, group]
             first = at[:, group] if limited is None else limited[:, group]
-            v[:, group], rest[group], row[group], at[:, group] = self._chord(
+            v[:, group], rest[group], bus[group], at[:, group] = self._chord.solve(
                 s[:, group], begin, self._steering(level, begin.mean(axis=1)), steps, first
             )
         for k in np.flatnonzero(~(rest < TOLERANCE)):
             v[:, k], _, left, at[:, k] = self._switched(s[:, k], self.flat, 30)
-            row[k] = abs(left).argmax()
+            bus[k] = self._bus_of_row(abs(left).argmax())
             rest[k] = abs(left).max()
         names = np.arange(s.shape[1]) if hours is None else hours
         return HourlySolution(
             v,
             rest < TOLERANCE,
             rest * self.network.base_mva,
-            self.network.bus[self._bus_of_row(row)],
+            self.network.bus[bus],
             names,
             at,
         )
@@ -355,56 +370,10 @@ class PowerFlow:
         if level not in self._steerings:
             if len(self._steerings) > MOST_LEVELS:
                 self._steerings.clear()
-            self._steerings[level] = Steering(self._jacobian(v, self.moving), len(self.free) + len(self.pq))
+            self._steerings[level] = Steering(
+                self._jacobian(v, self._chord.moving), len(self.free) + len(self.pq)
+            )
         return self._steerings[level]
-
-    def _chord(
-        self, s: Phasors, start: Phasors, steering: Steering, steps: int, limited: Limited
-    ) -> tuple[Phasors, Floats, Integers, Limited]:
-        """Newton with one Jacobian for all columns; columns that are done leave the loop."""
-        n, count = len(self.free), s.shape[1]
-        v, at = start.copy(), limited.copy()
-        worst, row = np.full(count, np.inf), np.zeros(count, dtype=np.int64)
-        todo, held = np.arange(count), self.network.v_set[self.pv]
-        size, angle = abs(start), np.angle(start)
-        looks = np.zeros(count, dtype=np.int64)
-        with np.errstate(all="ignore"):
-            for _ in range(steps):
-                now = size * np.exp(1j * angle)
-                current = self._y @ now
-                rest = self._mismatch(now, current, s[:, todo], at[:, todo])
-                level = abs(rest).max(axis=0)
-                if len(self.pv) and (level < CLOSE).any():
-                    settled = np.flatnonzero(level < CLOSE)
-                    hours = todo[settled]
-                    back = looks[hours] < LOOKS // 2
-                    fresh = self._switch(
-                        now[:, settled], current[:, settled], s[:, hours], at[:, hours], back
-                    )
-                    changed = (fresh != at[:, hours]).any(axis=0) & (looks[hours] < LOOKS)
-                    looks[hours[changed]] += 1
-                    if changed.any():
-                        at[:, hours[changed]] = fresh[:, changed]
-                        released = fresh == 0
-                        sizes = size[np.ix_(self.pv, settled)]
-                        size[np.ix_(self.pv, settled)] = np.where(released, held[:, None], sizes)
-                        level[settled[changed]] = 1.0
-                        now[:, settled] = size[:, settled] * np.exp(1j * angle[:, settled])
-                        current = self._y @ now
-                        rest = self._mismatch(now, current, s[:, todo], at[:, todo])
-                    unsettled = (fresh != at[:, hours]).any(axis=0)
-                    level[settled[unsettled]] = np.inf
-                v[:, todo], worst[todo] = now, np.where(np.isfinite(level), level, np.inf)
-                row[todo] = abs(rest).argmax(axis=0)
-                going = (level >= TOLERANCE) & (level < 1e3)
-                if not going.any():
-                    break
-                if going.mean() < 0.7:
-                    todo, size, angle, rest = todo[going], size[:, going], angle[:, going], rest[:, going]
-                move = steering.step(rest, at[:, todo])
-                angle[self.free] -= move[:n]
-                size[self.moving] -= move[n:]
-        return v, worst, row, at
 
     def sensitivities(
         self, v: Phasors, directions: Phasors, scale: Floats, limited: Limited | None = None
@@ -431,43 +400,26 @@ class PowerFlow:
             pu per unit of the parameter; zero at buses that hold their voltage. Without `reactive_limits` the
             moving buses are the `pq` buses.
         """
-        n = len(self.free)
         at = np.zeros((len(self.pv), v.shape[1]), dtype=np.int8) if limited is None else limited
         result = np.empty((len(self.moving), v.shape[1], len(directions)))
-        unit, current = v / abs(v), self._y @ v
-        for level, group in self._levels(v * current.conj()):
-            steering = self._steering(level, v[:, group].mean(axis=1))
-            vg, ug, ig, ag = v[:, group], unit[:, group], current[:, group].conj(), at[:, group]
-            for j, direction in enumerate(directions / self.network.base_mva):
-                base = np.r_[direction[self.free].real, direction[self.pq].imag, direction[self.pv].imag]
-                right = np.outer(base, scale[group])
-                right[n + len(self.pq) :][ag == 0] = 0.0
-                size = abs(right).max()
-                x = steering.step(right, ag)
-                for _ in range(60):
-                    dv = np.zeros_like(vg)
-                    dv[self.free] = 1j * vg[self.free] * x[:n]
-                    dv[self.moving] += ug[self.moving] * x[n:]
-                    power = dv * ig + vg * (self._y @ dv).conj()
-                    rows = [power[self.free].real, power[self.pq].imag]
-                    if len(self.pv):
-                        rows.append(np.where(ag == 0, 0.0, power[self.pv].imag))
-                    rest = np.concatenate(rows) - right
-                    if abs(rest).max() <= 1e-8 * size:
-                        break
-                    x -= steering.step(rest, ag)
-                else:  # close to the limit of power transfer one Jacobian no longer steers all hours
-                    for k in range(len(group)):
-                        x[:, k] = self._exactly(vg[:, k], ag[:, k], right[:, k])
-                result[:, group, j] = x[n:]
+        change = directions.T / self.network.base_mva
+        right = np.vstack([change[self.free].real, change[self._chord.moving].imag])
+        for level, group in self._levels(v * (self._y @ v).conj()):
+            vg, ag = v[:, group], at[:, group]
+
+            def exactly(k: int, wanted: Floats, vg: Phasors = vg, ag: Limited = ag) -> Floats:
+                return self._exactly(vg[:, k], ag[:, k], wanted)
+
+            steering = self._steering(level, vg.mean(axis=1))
+            result[:, group] = self._chord.sensitivities(vg, right, scale[group], steering, ag, exactly)
         return result
 
     def _exactly(self, v: Phasors, limited: Limited, right: Floats) -> Floats:
         """Moves of angles and sizes for residuals of one hour, from its own Jacobian."""
         n, m = len(self.free), len(self.pq)
-        unheld = np.flatnonzero(limited)
-        rows = np.r_[np.arange(n + m), n + m + unheld]
-        jacobian = self._jacobian(v, np.r_[self.pq, self.pv[unheld]])
+        at = np.isin(self._chord.moving[m:], self.pv[limited != 0])
+        rows = np.r_[np.ones(n + m, dtype=bool), at]
+        jacobian = self._jacobian(v, self._chord.moving[rows[n:]])
         x = np.zeros(len(right))
         try:
             if isinstance(jacobian, np.ndarray):

@@ -9,10 +9,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from dcvrt.grid.switching import Limited
-
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+Sets = list[tuple[Integers, Integers]]
+"""Sets of `pv` buses at a limit, each with the columns in which it is at one."""
 
 
 class Steering:
@@ -31,59 +31,69 @@ class Steering:
     """
 
     def __init__(self, jacobian: Any, basic: int) -> None:
-        self.dense = isinstance(jacobian, np.ndarray)
-        self._factors: Any = None
         inner = jacobian[:basic, :basic]
-        if self.dense:
+        outer, below, corner = jacobian[:basic, basic:], jacobian[basic:, :basic], jacobian[basic:, basic:]
+        self._basic = basic
+        self._first: Any = None
+        self._factors: Any = None
+        if isinstance(jacobian, np.ndarray):  # single precision is enough to steer
             inverse = np.linalg.inv(inner)
-            self._inverse = inverse.astype(np.float32)
+            column = inverse @ outer
+            self._first = np.vstack([inverse, -below @ inverse]).astype(np.float32)
+            self._column = column.astype(np.float32)
         else:
             self._factors = spla.splu(sp.csc_matrix(inner))
-        self._column, self._row, self._schur = np.zeros((basic, 0)), np.zeros((0, basic)), np.zeros((0, 0))
-        if jacobian.shape[0] > basic:
-            outer, below, corner = (
-                jacobian[:basic, basic:],
-                jacobian[basic:, :basic],
-                jacobian[basic:, basic:],
-            )
-            if self.dense:
-                self._column, self._row = inverse @ outer, below @ inverse
-            else:
-                outer, below, corner = (np.asarray(m.toarray(), float) for m in (outer, below, corner))
-                self._column = np.asarray(self._factors.solve(outer), dtype=np.float64)
-                self._row = np.asarray(self._factors.solve(below.T.copy(), "T").T, dtype=np.float64)
-            self._schur = corner - below @ self._column
+            outer, below, corner = (np.asarray(m.toarray(), float) for m in (outer, below, corner))
+            self._column = column = np.asarray(self._factors.solve(outer), dtype=np.float64)
+            self._below = below
+        self._schur = corner - below @ column
         self._inverted: dict[bytes, Floats] = {}
 
-    def step(self, rest: Floats, at_limit: Limited) -> Floats:
-        """Step for residuals (rows, hours): angles, sizes at `pq`, sizes at `pv` buses (0 where held)."""
-        n = self._column.shape[0]
-        inner = self._solve(rest[:n])
-        if not at_limit.any():
-            return np.vstack([inner, np.zeros((len(self._schur), rest.shape[1]))])
-        short = rest[n:] - self._row @ rest[:n]
-        size = np.zeros_like(short)
-        for buses, hours in same_sets(at_limit != 0):
-            key = buses.tobytes()
-            if key not in self._inverted:
-                block = np.linalg.inv(self._schur[np.ix_(buses, buses)])
-                self._inverted[key] = np.asarray(block, dtype=np.float64)
-            size[np.ix_(buses, hours)] = self._inverted[key] @ short[np.ix_(buses, hours)]
-        return np.vstack([inner - self._column @ size, size])
+    def step(self, rest: Floats, at_limit: Sets) -> Floats:
+        """Step for residuals (rows, hours): angles, sizes at `pq`, sizes at `pv` buses (0 where held).
 
-    def _solve(self, rest: Floats) -> Floats:
-        if not self.dense:
-            return np.asarray(self._factors.solve(np.ascontiguousarray(rest)))
-        size = max(float(abs(rest).max(initial=0.0)), 1e-300)  # scaled: single precision underflows
-        return np.asarray(size * (self._inverse @ (rest / size).astype(np.float32)), dtype=np.float64)
+        `at_limit` are the `pv` buses at a limit, as `same_sets` gives them.
+        """
+        n = self._basic
+        largest = max(float(abs(rest).max(initial=0.0)), 1e-300)  # scaled: single precision underflows
+        if self._factors is None:
+            found = self._first @ (rest[:n] / largest).astype(np.float32)
+        else:
+            inner = self._factors.solve(rest[:n] / largest)
+            found = np.vstack([inner, -self._below @ inner])
+        size = found[n:]  # of the rows of `pv` buses: what is left of their residuals once the others are met
+        short = size + rest[n:] / largest if at_limit else size
+        size[:] = 0.0
+        for buses, hours in at_limit:
+            if len(hours) == rest.shape[1]:
+                size[buses] = self._inverse(buses) @ short[buses]
+            else:
+                at = np.ix_(buses, hours)
+                size[at] = self._inverse(buses) @ short[at]
+        if at_limit:
+            used = np.unique(np.concatenate([buses for buses, _ in at_limit]))
+            found[:n] -= self._column[:, used] @ size[used]
+        return np.multiply(found, largest, dtype=np.float64)
+
+    def _inverse(self, buses: Integers) -> Floats:
+        """Inverse of the Schur complement of some `pv` buses."""
+        key = buses.tobytes()
+        if key not in self._inverted:
+            block = np.linalg.inv(self._schur[np.ix_(buses, buses)])
+            self._inverted[key] = np.asarray(block, dtype=self._column.dtype)
+        return self._inverted[key]
 
 
-def same_sets(chosen: npt.NDArray[np.bool_]) -> list[tuple[Integers, Integers]]:
+def same_sets(chosen: npt.NDArray[np.bool_]) -> Sets:
     """Sets of rows that occur in columns, each with its columns; columns without any are left out."""
-    packed = np.ascontiguousarray(np.packbits(chosen, axis=0).T)
-    code = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
-    order = np.argsort(code, kind="stable")
-    _, begin = np.unique(code[order], return_index=True)
-    groups = np.split(order, begin[1:])
+    if not chosen.any():
+        return []
+    packed = np.packbits(chosen, axis=0)
+    words = np.zeros((-(-len(packed) // 8) * 8, packed.shape[1]), dtype=np.uint8)
+    words[: len(packed)] = packed
+    code = np.ascontiguousarray(words.T).view(np.uint64)
+    order = np.lexsort(code.T)
+    same = (code[order[1:]] == code[order[:-1]]).all(axis=1)
+    groups = np.split(order, np.flatnonzero(~same) + 1)
     sets = [(np.flatnonzero(chosen[:, hours[0]]), hours) for hours in groups]
     return [(buses, hours) for buses, hours in sets if len(buses)]

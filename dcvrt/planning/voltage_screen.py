@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ Integers = npt.NDArray[np.int64]
 MOST_KEPT = 4
 """Capacities whose voltages are kept to start from."""
 SAME = 1e-6
-"""Difference of capacities that counts as none, MW."""
+"""Difference of capacities that counts as none, MW: it moves no voltage by 1e-8 pu."""
 BUSES_A_ROUND = 4
 """Buses whose violated limits become cuts together."""
 
@@ -86,24 +87,29 @@ class HostedFlow:
         return self.unhosted.v
 
     def solve(self, H: Floats, hours: Integers | None = None) -> HourlySolution:
-        """AC power flow at `H` of the hours at the given positions (default all)."""
+        """AC power flow at `H` of the hours at the given positions (default all).
+
+        Hours that were solved at these capacities before are not solved again.
+        """
+        known = self._known(H)
         at = self._all if hours is None else hours
-        base, known = self.unhosted, self._known(H)
-        solved = self.flow.solve_hours(
-            self._demand(H, at),
-            start=known.v[:, at],
-            hours=self.year.hours[at],
-            limited=known.limited[:, at],
-        )
-        if H.any():
-            known.v[:, at] = np.where(solved.converged, solved.v, base.v[:, at])
-            known.limited[:, at] = np.where(solved.converged, solved.limited, base.limited[:, at])
-        return solved
+        fresh = at[~known.converged[at]]
+        if len(fresh):
+            solved = self.flow.solve_hours(
+                self._demand(H, fresh),
+                start=known.v[:, fresh],
+                hours=self.year.hours[fresh],
+                limited=known.limited[:, fresh],
+            )
+            known.update(fresh, solved)
+        found = known.take(at)
+        failed = at[~known.converged[at]]
+        known.v[:, failed], known.limited[:, failed] = self.base[:, failed], self.unhosted.limited[:, failed]
+        return found
 
     def _known(self, H: Floats) -> HourlySolution:
-        """Where to start: what was last solved at `H`, a copy of what is known nearest to it otherwise.
-
-        A search comes back to the same capacities again and again.
+        """What was solved at `H`, all hours; those that were not hold what is known nearest to it, to start
+        from. A search comes back to the same capacities again and again.
         """
         if not H.any():
             return self.unhosted
@@ -113,7 +119,7 @@ class HostedFlow:
             self._solved.append(self._solved.pop(nearest))
             return self._solved[-1][1]
         start = self.unhosted if nearest is None else self._solved[nearest][1]
-        fresh = replace(start, v=start.v.copy(), limited=start.limited.copy())
+        fresh = start.unsolved()
         self._solved = [*self._solved[1 - MOST_KEPT :], (H.copy(), fresh)]
         return fresh
 
@@ -221,17 +227,6 @@ class VoltageScreen:
         most = self._constant_range[1] + self._slope_range[1] @ H
         return np.flatnonzero((least < self._tightest[0] + margin) | (most > self._tightest[1] - margin))
 
-    def _widen_ranges(self, hours: Integers, rows: Integers | None = None) -> None:
-        """Take what changed in some hours, and in all hours of some rows, into the extremes."""
-        for values, (least, most) in (
-            (self.constant, self._constant_range),
-            (self.slope, self._slope_range),
-        ):
-            np.minimum(least, values[:, hours].min(axis=1), out=least)
-            np.maximum(most, values[:, hours].max(axis=1), out=most)
-            if rows is not None:
-                least[rows], most[rows] = values[rows].min(axis=1), values[rows].max(axis=1)
-
     def voltages(self, H: Floats, rows: Integers | None = None) -> Floats:
         """Linear voltages in all hours, of all moving buses or of some rows of them, pu."""
         slope, constant = (
@@ -241,9 +236,16 @@ class VoltageScreen:
 
     def room(self, voltage: Floats, rows: Integers, hours: Integers | slice = slice(None)) -> Floats:
         """Distance of voltages, (rows, hours), to the nearer limit, pu; negative beyond it."""
-        at = (rows, slice(None)) if isinstance(hours, slice) else np.ix_(rows, hours)
-        low, high = self.lower[at], self.upper[at]
-        return np.minimum(voltage - low, high - voltage)
+        low, high = self._limits(rows, hours)
+        room = voltage - low
+        return np.minimum(room, high - voltage, out=room)
+
+    def _limits(self, rows: Integers, hours: Integers | slice = slice(None)) -> tuple[Any, Any]:
+        """Lower and upper limits, (rows, hours); one number each where they are the same everywhere."""
+        if not self.widened:
+            return self.limits
+        at = (rows, hours) if isinstance(hours, slice) else np.ix_(rows, hours)
+        return self.lower[at], self.upper[at]
 
     def tangent(self, bus: int, hour: int, side: int) -> Tangent:
         """The present linearisation of one voltage against one of its limits."""
@@ -259,7 +261,8 @@ class VoltageScreen:
             return []
         now = self.voltages(H, rows)
         found = []
-        for side, over in ((-1, self.lower[rows] - now), (1, now - self.upper[rows])):
+        low, high = self._limits(rows)
+        for side, over in ((-1, low - now), (1, now - high)):
             hour = over.argmax(axis=1)
             worst = over[np.arange(len(rows)), hour]
             for k in np.argsort(-worst, kind="stable")[:BUSES_A_ROUND].tolist():
@@ -287,9 +290,21 @@ class VoltageScreen:
         expected : array (rows, all hours) or None
             Voltages, pu; None leaves the other hours as they are.
         """
-        if expected is not None:
-            self.constant[rows] += expected - self.voltages(H, rows)
         chosen = hours[steep]
         self.slope[:, chosen] = self.ac.slopes(solved.take(steep), chosen)
-        self.constant[:, hours] = self.sizes(solved) - self.slope[:, hours] @ H
-        self._widen_ranges(hours, rows if expected is not None else None)
+        drop = (self.slope.reshape(-1, len(H)) @ H).reshape(self.constant.shape)
+        if expected is not None:
+            self.constant[rows] = expected - drop[rows]
+        self.constant[:, hours] = self.sizes(solved) - drop[:, hours]
+        _widen(self._constant_range, self.constant, hours)
+        _widen(self._slope_range, self.slope, chosen)
+        if expected is not None:
+            for side, extreme in zip(self._constant_range, (np.min, np.max), strict=True):
+                side[rows] = extreme(self.constant[rows], axis=1)
+
+
+def _widen(range_: tuple[Floats, Floats], values: Floats, hours: Integers) -> None:
+    """Take what changed in some hours into the extremes over the hours."""
+    if len(hours):
+        np.minimum(range_[0], values[:, hours].min(axis=1), out=range_[0])
+        np.maximum(range_[1], values[:, hours].max(axis=1), out=range_[1])
