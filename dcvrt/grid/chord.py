@@ -159,7 +159,7 @@ class Chord:
         close = np.flatnonzero(level < CLOSE)
         if not len(close):
             return False
-        size = abs(v[self._pq : self._sizes, close])
+        size = np.asarray(abs(v[self._pq : self._sizes, close]), dtype=np.float64)
         was = at[:, close]
         now = switched(
             was, q[:, close], size, self._held, self._q_low, self._q_high, looks[close] < LOOKS // 2

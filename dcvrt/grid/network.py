@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ Integers = npt.NDArray[np.int64]
 
 KINDS = ("pq", "pv", "slack")
 """What power flow holds at a bus: P and Q, P and voltage, or voltage and angle."""
+DENSE = 1000
+"""Buses up to which dense matrices are quicker than sparse solves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,15 +257,15 @@ class Network:
         Returns
         -------
         array (branches, buses)
-            Dense, and so meant for small networks: `transfer` and `adjoint` give what is needed of it by
-            sparse solves. The column of the slack bus is zero. See `flows` for the constant part that phase
-            shifters add.
+            Dense, and so meant for small networks: in larger ones `transfer` and `adjoint` give what is needed
+            of it by sparse solves. The column of the slack bus is zero. See `flows` for the constant part that
+            phase shifters add.
         """
         return self._ptdf
 
     @cached_property
     def _ptdf(self) -> Floats:
-        factors = np.ascontiguousarray(self.transfer(np.eye(len(self.bus))))
+        factors = np.ascontiguousarray(self._flow_of_angle @ self._angles(np.eye(len(self.bus))))
         factors.flags.writeable = False
         return factors
 
@@ -279,6 +281,8 @@ class Network:
         -------
         array (branches,) or (branches, count)
         """
+        if len(self.bus) <= DENSE:
+            return self._ptdf @ injection
         return self._flow_of_angle @ self._angles(injection)
 
     @cached_property
@@ -286,7 +290,7 @@ class Network:
         return (sp.diags(self.susceptance) @ self.incidence).tocsr()
 
     def adjoint(self, weights: Floats) -> Floats:
-        r"""Weighted sum of rows of the transfer factors, :math:`\mathrm{PTDF}^T w`, by one sparse solve.
+        r"""Weighted sum of rows of the transfer factors, :math:`\mathrm{PTDF}^T w`.
 
         Parameters
         ----------
@@ -297,6 +301,8 @@ class Network:
         array (buses,) or (buses, count)
             Change of the weighted flow per MW injected at each bus.
         """
+        if len(self.bus) <= DENSE:
+            return self._ptdf.T @ weights
         return self._angles(self._flow_of_angle.T @ weights)
 
     @cached_property
@@ -312,6 +318,15 @@ class Network:
         """
         offset = self.shift_flow if injection.ndim == 1 else self.shift_flow[:, None]
         return self.transfer(injection) + offset
+
+    def with_ratings(self, rating: Floats) -> Network:
+        """The same network with other branch ratings, MVA; what was computed of it goes along."""
+        fresh = replace(self, branches=replace(self.branches, rating=rating))
+        for name in ("incidence", "_reduced_laplacian", "_flow_of_angle"):
+            fresh.__dict__[name] = getattr(self, name)
+        if len(self.bus) <= DENSE:
+            fresh.__dict__["_ptdf"] = self._ptdf
+        return fresh
 
     # -- where networks come from --------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import scipy.sparse.linalg as spla
 
 from dcvrt.errors import SimulationError
 from dcvrt.grid.chord import TOLERANCE, Chord
-from dcvrt.grid.network import Network
+from dcvrt.grid.network import DENSE, Network
 from dcvrt.grid.steering import Steering
 from dcvrt.grid.switching import LOOKS, Limited, reactive_limits_at, switched
 
@@ -24,8 +24,9 @@ Phasors = npt.NDArray[np.complex128]
 LEVEL = 0.02
 """Hours whose load lies within so much of the reference load share one Jacobian."""
 MOST_LEVELS = 60
-DENSE = 1000
-"""Buses up to which the Jacobian is a dense matrix."""
+FEW = 20
+"""Hours up to which a known Jacobian is taken from up to `NEARBY` levels away."""
+NEARBY = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +340,7 @@ class PowerFlow:
                 begin = start[:, group]
             first = at[:, group] if limited is None else limited[:, group]
             v[:, group], rest[group], bus[group], at[:, group] = self._chord.solve(
-                s[:, group], begin, self._steering(level, begin.mean(axis=1)), steps, first
+                s[:, group], begin, self._steering(level, begin), steps, first
             )
         for k in np.flatnonzero(~(rest < TOLERANCE)):
             v[:, k], _, left, at[:, k] = self._switched(s[:, k], self.flat, 30)
@@ -366,13 +367,14 @@ class PowerFlow:
         return list(zip(found.tolist(), np.split(order, begin[1:]), strict=True))
 
     def _steering(self, level: int, v: Phasors) -> Steering:
-        """The steering of a load level, made at `v` when it is first needed."""
-        if level not in self._steerings:
-            if len(self._steerings) > MOST_LEVELS:
-                self._steerings.clear()
-            self._steerings[level] = Steering(
-                self._jacobian(v, self._chord.moving), len(self.free) + len(self.pq)
-            )
+        """The steering of a load level, made at the mean voltages of some hours when it is first needed."""
+        known = min(self._steerings, key=lambda other: abs(other - level), default=None)
+        if known is not None and abs(known - level) <= (NEARBY if v.shape[1] <= FEW else 0):
+            return self._steerings[known]
+        if len(self._steerings) > MOST_LEVELS:
+            self._steerings.clear()
+        jacobian = self._jacobian(v.mean(axis=1), self._chord.moving)
+        self._steerings[level] = Steering(jacobian, len(self.free) + len(self.pq))
         return self._steerings[level]
 
     def sensitivities(
@@ -410,7 +412,7 @@ class PowerFlow:
             def exactly(k: int, wanted: Floats, vg: Phasors = vg, ag: Limited = ag) -> Floats:
                 return self._exactly(vg[:, k], ag[:, k], wanted)
 
-            steering = self._steering(level, vg.mean(axis=1))
+            steering = self._steering(level, vg)
             result[:, group] = self._chord.sensitivities(vg, right, scale[group], steering, ag, exactly)
         return result
 

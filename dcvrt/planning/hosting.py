@@ -122,8 +122,7 @@ class HostingProblem:
             if low > high
         ]
         raise_all(problems, "hosting problem")
-        lines = network.branches
-        self.network = replace(network, branches=replace(lines, rating=lines.rating * rating_scale))
+        self.network = network.with_ratings(network.branches.rating * rating_scale)
         self.sites, self.year, self.rating_scale = sites, hours, rating_scale
         self.voltage, self.pf, self.voltage_screen = voltage, pf, voltage_screen
         self.lower, self.upper = lower, upper

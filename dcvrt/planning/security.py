@@ -104,8 +104,8 @@ class Outages:
         self.rule = rule
         lines = network.branches
         labels = [lines.label(k) for k in range(len(lines))]
-        chosen = () if rule is None else labels if rule.outages is None else tuple(rule.outages)
-        candidates = np.flatnonzero([label in set(chosen) for label in labels])
+        chosen = set(() if rule is None else labels if rule.outages is None else rule.outages)
+        candidates = np.flatnonzero([label in chosen for label in labels])
         exchange = network.transfer(network.incidence[candidates].T.toarray())
         remaining = 1.0 - exchange[candidates, np.arange(len(candidates))]
         whole = remaining > SPLITS
