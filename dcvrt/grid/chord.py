@@ -31,7 +31,7 @@ HOPELESS = 1e3
 """Mismatch from which on an hour is given up, pu."""
 CROWDED = 0.7
 """Share of columns still under way below which the others are taken out: copying costs time too."""
-RELATIVE = 1e-8
+RELATIVE = 1e-9
 """Residual of sensitivities, over their right-hand side."""
 SENSITIVITY_STEPS = 60
 BLOCK = 256

@@ -383,7 +383,7 @@ class PowerFlow:
         r"""Derivative of the voltage magnitude at every `moving` bus by each hosted MW, exactly at `v`.
 
         Solves :math:`J_t\, x = d_t\, r_j` in every hour t for every direction r_j, by chord iteration with
-        exact residuals, to a relative residual of 1e-8. A bus at a reactive limit keeps its Q.
+        exact residuals, to a relative residual of 1e-9. A bus at a reactive limit keeps its Q.
 
         Parameters
         ----------
