@@ -257,9 +257,9 @@ class Network:
         Returns
         -------
         array (branches, buses)
-            Dense, and so meant for small networks: in larger ones `transfer` and `adjoint` give what is needed
-            of it by sparse solves. The column of the slack bus is zero. See `flows` for the constant part that
-            phase shifters add.
+            Dense, and so meant for small networks: in larger ones `transfer` and `adjoint` give what is
+            needed of it by sparse solves. The column of the slack bus is zero. See `flows` for the constant
+            part that phase shifters add.
         """
         return self._ptdf
 

@@ -83,6 +83,17 @@ def per_site(
     return sizes
 
 
+def hosting_faults(hosting: Mapping[int, float], sites: tuple[int, ...]) -> list[str]:
+    """What is wrong with given capacities."""
+    return [
+        f"{bus!r} is not a site.{did_you_mean(bus, sites)}"
+        if bus not in sites
+        else f"the capacity of site {bus} is {mw:g} MW; it must be finite and not negative."
+        for bus, mw in hosting.items()
+        if bus not in sites or not 0 <= mw < np.inf
+    ]
+
+
 def unit_faults(network: Network, hours: Year) -> list[str]:
     """Units with limits of their own in some hours that are unknown, or whose limits cross."""
     units = network.generators

@@ -14,7 +14,13 @@ from dcvrt.errors import InfeasibleError, InputError, SimulationError, did_you_m
 from dcvrt.grid.network import Network
 from dcvrt.planning import monolith, report
 from dcvrt.planning.agreement import Agreement
-from dcvrt.planning.arguments import argument_faults, per_site, row_faults, unit_faults
+from dcvrt.planning.arguments import (
+    argument_faults,
+    hosting_faults,
+    per_site,
+    row_faults,
+    unit_faults,
+)
 from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import FlowCut
 from dcvrt.planning.master import Cut, Master, Question, Solution
@@ -213,7 +219,13 @@ class HostingProblem:
         ----------
         hosting : mapping of bus number to MW
             Sites that are left out host nothing; capacities may be `SETTLED` too large.
+
+        Raises
+        ------
+        InputError
+            When something names no site, is negative or not finite.
         """
+        raise_all(hosting_faults(hosting, self.sites), "capacities")
         H = np.maximum([hosting.get(bus, 0.0) - SETTLED for bus in self.sites], 0.0)
         hours, screen = self.certifier, self.screen
         cut = hours.certify(H)

@@ -212,6 +212,11 @@ class Master:
         self.may_close = relief or bool(((lower > 0) & ~self.must_open).any())
         """Whether closing a site can help; if not, the programme is linear."""
 
+    @property
+    def always(self) -> Flags:
+        """Requirement rows that hold for every plan: those of no site, or of one that must be open."""
+        return np.asarray((self._site < 0) | self.must_open[self._site])
+
     def forbid(self, is_open: Flags) -> None:
         """Leave out a choice of open sites from now on."""
         self._forbidden.append(is_open.copy())
@@ -357,9 +362,9 @@ class Master:
         )
 
     def least_violations(self) -> Floats | None:
-        """How far each requirement row that belongs to no site is missed when all are missed by the least
+        """How far each requirement row that holds for every plan is missed when all are missed by the least
         sum; rows are weighed by their largest coefficient. None when the cuts alone exclude everything."""
-        general = np.flatnonzero(self._site < 0)
+        general = np.flatnonzero(self.always)
         cuts, count = self._cut_block(), len(general)
         size = np.maximum(abs(self.coefficients[general]).max(axis=1, initial=0.0), 1e-300)
         slack = np.hstack([np.diag(size), -np.diag(size)])

@@ -317,8 +317,9 @@ def base_case(hours: Hours, rating_scale: float) -> str:
 
 
 def no_plan(master: Master) -> str:
-    """Say which of the rows that belong to no site exclude every plan, and by how much."""
-    general = [row for row in master.rows if row.site is None]
+    """Say which of the rows that hold for every plan exclude every one, and by how much."""
+    general = [row for row, holds in zip(master.rows, master.always, strict=True) if holds]
+    forced = [bus for bus, must in zip(master.sites, master.must_open, strict=True) if must]
     missed = master.least_violations()
     if missed is None or not (missed > NO_PRICE).any():
         listed = ", ".join(row.label for row in general[:6]) + (", ..." if len(general) > 6 else "")
@@ -331,10 +332,12 @@ def no_plan(master: Master) -> str:
             if missed[r] > NO_PRICE
         ]
         named = f"Missed: {', '.join(parts)}."
+    others = "every other site" if forced else "every site"
     return (
-        f"No capacities meet all requirement rows, not even with every site closed. {named} "
-        "Ways out: give a row the site that it belongs to, so that the site can be closed, or relax its "
-        "limit."
+        f"No capacities meet all requirement rows, not even with {others} closed. {named} "
+        "Ways out: give a row the site that it belongs to, so that the site can be closed, "
+        + (f"let site {', '.join(map(str, forced))} be closed, " if forced else "")
+        + "or relax its limit."
     )
 
 

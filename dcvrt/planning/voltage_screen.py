@@ -78,8 +78,11 @@ class HostedFlow:
 
     @cached_property
     def unhosted(self) -> HourlySolution:
-        """Power flow with nothing hosted; raises `SimulationError` where there is none."""
-        return self.flow.solve_hours(self.scheduled, hours=self.year.hours).require()
+        """Power flow with nothing hosted; raises `InfeasibleError` where there is none."""
+        solved = self.flow.solve_hours(self.scheduled, hours=self.year.hours)
+        if not solved.converged.all():
+            raise InfeasibleError(_no_base(self.network, solved))
+        return solved
 
     @property
     def base(self) -> npt.NDArray[np.complex128]:
@@ -164,9 +167,8 @@ class VoltageScreen:
     Raises
     ------
     InfeasibleError
-        Naming the buses and hours that are outside the limits with nothing hosted.
-    SimulationError
-        When an hour has no power flow with nothing hosted.
+        Naming the buses and hours that are outside the limits with nothing hosted, or the hours that have no
+        power flow then.
     """
 
     def __init__(self, ac: HostedFlow, limits: tuple[float, float], base_violations: str) -> None:
@@ -301,6 +303,20 @@ class VoltageScreen:
         if expected is not None:
             for side, extreme in zip(self._constant_range, (np.min, np.max), strict=True):
                 side[rows] = extreme(self.constant[rows], axis=1)
+
+
+def _no_base(network: Network, solved: HourlySolution) -> str:
+    """Say which hours have no power flow with nothing hosted."""
+    failed = np.flatnonzero(~solved.converged)
+    named = ", ".join(str(hour) for hour in solved.hours[failed[:5]]) + (", ..." if len(failed) > 5 else "")
+    buses, count = np.unique(solved.worst_bus[failed], return_counts=True)
+    worst = ", ".join(str(bus) for bus in buses[np.argsort(-count, kind="stable")[:3]])
+    return (
+        f"{network.name}: with nothing hosted {len(failed)} of {len(solved.hours)} hours have no AC power "
+        f"flow (hours {named}).\n  Newton's method ends with the largest mismatch at bus {worst}.\n"
+        "Ways out: check loads, reactive limits and voltage set points, leave these hours out, or "
+        "voltage=None for line limits alone."
+    )
 
 
 def _widen(range_: tuple[Floats, Floats], values: Floats, hours: Integers) -> None:

@@ -155,7 +155,8 @@ def problems_of(ask: Ask, setting: Setting) -> list[str]:
         for mode in ask.modes
         if mode not in known
     ]
-    for mode in [mode for mode in ask.modes if mode in known]:
+    # Where none is known, the modes of the study tell what else is wrong, so that all is told at once.
+    for mode in [mode for mode in ask.modes if mode in known] or setting.file.facility.modes:
         dae = replay.simulator_of(mode, {}).dae
         for parameter in ask.parameters:
             problems += [

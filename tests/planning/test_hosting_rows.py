@@ -254,6 +254,42 @@ def test_rows_that_no_plan_meets_are_named() -> None:
     )
 
 
+def test_a_row_of_a_site_that_must_be_open_is_named(problem: HostingProblem) -> None:
+    with pytest.raises(InfeasibleError) as error:
+        problem.solve([margin(21, -0.5, -1e-3, "loss at 21")], must_open=(21,))
+    assert str(error.value) == (
+        "No capacities meet all requirement rows, not even with every other site closed. Missed: "
+        "loss at 21 (0.5 short at least). Ways out: give a row the site that it belongs to, so that the "
+        "site can be closed, let site 21 be closed, or relax its limit."
+    )
+
+
+def test_capacities_that_are_none_are_refused_together(problem: HostingProblem) -> None:
+    with pytest.raises(InputError) as error:
+        problem.allows({5: 1.0, 75: -2.0, 106: float("nan")})
+    assert str(error.value) == (
+        "capacities: 3 problems\n"
+        "  5 is not a site. Did you mean '75'? Known: 21, 75, 106, 108.\n"
+        "  the capacity of site 75 is -2 MW; it must be finite and not negative.\n"
+        "  the capacity of site 106 is nan MW; it must be finite and not negative."
+    )
+
+
+def test_a_base_case_beyond_the_nose_is_told_as_such() -> None:
+    """One line from a stiff source carries at most 1/(2 x) = 100 MW at unity power factor."""
+    two = network({1: "slack", 2: "pq"}, [(1, 2, complex(0.0, 0.5))], {1: 300.0}, {2: 110.0})
+    year = profiles.Year(np.arange(3), np.array([0.5, 1.0, 0.8]), {}, np.ones(3))
+    problem = HostingProblem(two, (2,), year, voltage=(0.5, 1.1), pf=1.0, reactive_limits=False)
+    with pytest.raises(InfeasibleError) as error:
+        problem.solve()
+    assert str(error.value) == (
+        f"{two.name}: with nothing hosted 1 of 3 hours have no AC power flow (hours 1).\n"
+        "  Newton's method ends with the largest mismatch at bus 2.\n"
+        "Ways out: check loads, reactive limits and voltage set points, leave these hours out, or "
+        "voltage=None for line limits alone."
+    )
+
+
 def test_overloaded_base_case_names_hours_lines_and_amount() -> None:
     with pytest.raises(InfeasibleError) as error:
         HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.4, voltage=None).solve()

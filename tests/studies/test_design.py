@@ -170,6 +170,14 @@ def test_everything_wrong_is_told_at_once(file: Path, capsys: pytest.CaptureFixt
     ]
 
 
+def test_an_unknown_mode_hides_no_unknown_parameter(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(str(file), "--hosting", "21=30", "--mode", "gfk", "--parameter", "bess.P_diss") == 2
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "design: 2 problems"
+    assert told[1].startswith("  --mode gfk: no such variant. Did you mean 'gfm'?")
+    assert told[2].startswith("  --parameter bess.P_diss: variant 'gfl' has no such parameter. Did you mean")
+
+
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
