@@ -15,6 +15,8 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 LINES_A_ROUND = 10
+ROOM = 5.0
+"""Room that a dispatch keeps below every limit of a branch, as far as it can, MVA."""
 STALLED = 1e-7
 """Tolerance of the simplex method where it does not reach that of the master programme, MW."""
 INTACT = -1
@@ -79,6 +81,9 @@ class HourDispatch:
         \mathbf 1 \cdot g + u - v = -\mathbf 1\cdot n, \qquad
         \pm (f_l + L_{lk} f_k)(n + C_g g) - s \le \overline f_{lk}, \qquad \underline g \le g \le \overline g
 
+    Where nothing is short, s may fall to `-ROOM` in a second run: a dispatch with room serves other hours,
+    where one at the limits, as the simplex method leaves it, serves few.
+
     Flows come from sparse solves and the coefficients of a row from one adjoint solve, so that large networks
     need no matrix of transfer factors.
 
@@ -134,6 +139,22 @@ class HourDispatch:
         fixed = self.network.flows(injection)
         demand = -injection.sum()
         self._solver.changeColsBounds(n, np.arange(n, dtype=np.int32), low, high)
+        x, row_dual = self._least(fixed, demand, tolerance)
+        shortfall = float(x[n : n + 3].sum())
+        if shortfall > 0:
+            return Dispatched(shortfall, x[:n], self._dual(row_dual))
+        self._room(-ROOM, 0.0)
+        x, _ = self._least(fixed, demand, tolerance)
+        self._room(0.0, self._inf)
+        return Dispatched(0.0, x[:n], None)
+
+    def _room(self, low: float, high: float) -> None:
+        """Bounds of s, and of u and v above."""
+        at = np.arange(self._count, self._count + 3, dtype=np.int32)
+        self._solver.changeColsBounds(3, at, np.r_[low, 0.0, 0.0], np.full(3, high))
+
+    def _least(self, fixed: Floats, demand: float, tolerance: float) -> tuple[Floats, Floats]:
+        """Columns and row duals of the optimum, with all rows that it violates added."""
         while True:
             count = len(self._branch) + 1
             self._solver.changeRowsBounds(
@@ -145,11 +166,8 @@ class HourDispatch:
             self._run()
             solution = self._solver.getSolution()
             x = np.asarray(solution.col_value)
-            if not self._add_violated(fixed + self.flows_of(x[:n]), x[n], tolerance):
-                break
-        shortfall = float(x[n : n + 3].sum())
-        dual = self._dual(np.asarray(solution.row_dual)) if shortfall > 0 else None
-        return Dispatched(shortfall, x[:n], dual)
+            if not self._add_violated(fixed + self.flows_of(x[: self._count]), x[self._count], tolerance):
+                return x, np.asarray(solution.row_dual)
 
     def _run(self) -> None:
         """Run the simplex method; where it stalls short of its tolerances, again without the old basis, and
