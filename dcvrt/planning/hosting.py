@@ -352,12 +352,14 @@ class HostingProblem:
             master.cuts = kept
 
     def _wider(self, master: Master, best: Solution) -> Settled | None:
-        """A better plan that opens further sites, where only voltages linearised elsewhere spoke against it.
+        """A better plan that opens further sites, or others in place of one, where only voltages linearised
+        elsewhere spoke against it.
 
         With reactive limits these may understate; so the choice is made without them, and they are made anew
         on the way to its optimum, however low that seems in between.
         """
         kept = master.cuts  # the reasons of closed sites rest on them
+        master.forbid(best.open)
         for _ in range(len(self.sites)):
             master.cuts = [cut for cut in master.cuts if not isinstance(cut.origin, Tangent)]
             chosen = master.choose(beside=best.open)

@@ -224,29 +224,31 @@ class Master:
     def choose(self, beside: Flags | None = None) -> Solution | None:
         """Best choice of open sites under the cuts so far, or None when there is none.
 
-        With `beside`, the best that opens all of these sites and at least one more.
+        With `beside`, the best that opens all of these sites but one at most, and as many at least: further
+        ones, or others in place of one.
         """
         if not self.may_close:
             return self.solve(np.ones(self.count, dtype=bool))
         n, width = self.count, len(self.names)
         cuts, choice = self._cut_block(), self.with_choice()
-        forced = self.must_open if beside is None else self.must_open | beside
-        more = 0 if beside is None else int(beside.sum()) + 1
+        kept = np.zeros(n, dtype=bool) if beside is None else beside
+        same = int(kept.sum())
         other = np.array([np.where(no, -1.0, 1.0) for no in self._forbidden]).reshape(-1, n)
         found = _run(
             np.r_[self.cost, np.zeros(n)],
-            np.r_[np.zeros(width), forced.astype(float)],
+            np.r_[np.zeros(width), self.must_open.astype(float)],
             np.r_[self._column_upper(self.upper), np.ones(n)],
             np.vstack(
                 [
                     np.hstack([cuts.matrix, np.zeros((len(cuts.low), n))]),
                     choice.matrix,
                     np.r_[np.zeros(width), np.ones(n)],
+                    np.r_[np.zeros(width), kept.astype(float)],
                     np.hstack([np.zeros((len(other), width)), other]),
                 ]
             ),
-            np.r_[cuts.low, choice.low, more, [1.0 - no.sum() for no in self._forbidden]],
-            np.r_[cuts.high, choice.high, n, np.full(len(other), np.inf)],
+            np.r_[cuts.low, choice.low, same, same - 1, [1.0 - no.sum() for no in self._forbidden]],
+            np.r_[cuts.high, choice.high, n, n, np.full(len(other), np.inf)],
             np.r_[np.zeros(width, bool), np.ones(n, bool)],
         )
         if found is None:

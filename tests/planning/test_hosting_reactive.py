@@ -141,3 +141,22 @@ def test_a_site_that_has_to_be_large_is_opened_whatever_was_solved_before() -> N
         plan = problem.solve(rows=rows)
         assert plan.total_mw == pytest.approx(free.total_mw, abs=2e-3)
         assert not plan.closed
+
+
+def test_a_site_is_exchanged_for_a_better_one_of_which_linear_voltages_thought_less() -> None:
+    """70 in place of 60 hosts a tenth more, and no further site fits beside either choice."""
+    rows = (
+        Row({59: -8.5e-5, 70: -1.44e-4, 72: -1.06e-4, 73: -1.6e-4, 60: 1.75e-4}, 1.12e-3, "row at 60", 60),
+        Row({59: -3.3e-5, 60: -5.1e-5, 70: -5e-5, 73: -1.58e-4, 72: -1.13e-4}, -0.037, "row at 72", 72),
+    )
+    least = {59: 90.0, 60: 0.0, 70: 30.0, 72: 0.0, 73: 90.0}
+    day = YEAR.window(range(4946, 4970))
+
+    def fresh() -> HostingProblem:
+        return HostingProblem(NETWORK, (59, 60, 70, 72, 73), day, 0.83, pf=0.93, h_max=250.0, min_size=least)
+
+    other = fresh().solve(rows, bounds={60: (0.0, 0.0)}, must_open=(59, 70, 72))
+    problem = fresh()
+    plan = problem.solve(rows)
+    assert plan.total_mw >= other.total_mw - 2e-3
+    assert problem.check_ac(plan).passed
