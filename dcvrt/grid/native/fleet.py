@@ -161,10 +161,10 @@ class Group:
         rows = [row.path for row in self.structure.dae.states] + ["active current", "reactive current"]
         order = np.argsort(-np.nan_to_num(np.abs(residual[k]), nan=np.inf))[:5]
         named = ", ".join(f"{rows[j]} {residual[k, j]:.3g}" for j in order)
+        way_out = "host less" if self.structure.setpoints else "a higher rating of the facility, or less load"
         raise SimulationError(
-            f"{where}: {len(bad)} unit(s) have no equilibrium; largest residuals of "
-            f"{self.units[k].name} at bus "
-            f"{self.units[k].bus}: {named}. Way out: host less, or check its data."
+            f"{where}: {len(bad)} unit(s) have no equilibrium; largest residuals of {self.units[k].name} at "
+            f"bus {self.units[k].bus}: {named}. Way out: {way_out}, or check its data."
         )
 
     def _check_limits(self, guards: Floats, moves: Floats, where: str) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dcvrt import Simulator, Waveform, facility
+from dcvrt.errors import SimulationError
 from dcvrt.grid import BusFault, Grid, Period
 from dcvrt.grid.native.engine import Engine, sample_times
 from dcvrt.grid.native.run import Options, Simulated
@@ -99,6 +100,17 @@ def test_two_facilities_of_one_diagram_and_of_two_are_the_same() -> None:
         of, hosting, FAULT, 0.6, facilities={1: facility.gfl(), 3: facility.gfl()}, options=TIGHTEST
     )
     assert np.abs(one.v - two.v).max() < 1e-9
+
+
+def test_a_rating_that_does_not_carry_the_load_is_told_with_the_way_out(grid: Grid) -> None:
+    coupled = dict.fromkeys(NO_VRT, facility.gfl().compile())
+    with pytest.raises(SimulationError) as failure:
+        grid.waveforms(NO_VRT, BusFault(22), facilities=coupled, values={"beta": 0.85})
+    text = str(failure.value)
+    assert text.startswith(
+        "ieee118, base: 4 unit(s) have no equilibrium; largest residuals of facility gfl at "
+    )
+    assert text.endswith(" Way out: a higher rating of the facility, or less load, or check its data.")
 
 
 @pytest.mark.parametrize("name", ["gfl", "gfm"])
