@@ -6,8 +6,8 @@
  *
  * Its error estimate vanishes at h lambda = -7.08, where a step grows what it does not see 13 times: the step is
  * kept below REACH over the fastest rate that the last two stages show. Units whose last two stages differ by less
- * than STILL of the tolerance are not asked: a step brings what is so small to the size of the tolerance at most, and
- * then it shows; below, the difference is more often that of the slow motion, and its rate none of the unit's.
+ * than STILL of the tolerance are not asked: a step brings what is so small to half the tolerance at most, and then it
+ * shows; below, the difference is more often that of the slow motion, and its rate none of the unit's.
  *
  * Dense output of order 4: the cubic of Hermite with s^2 (1 - s)^2 h sum LAST_TERM k, one of a family that all
  * conditions of order 4 leave free; its last entry is the round number next to the least error of order 5 (2.04).
@@ -21,7 +21,7 @@
 
 enum { STAGES = 7 };
 #define REACH 5.3
-#define STILL 0.1
+#define STILL 0.03
 #define SMOOTH 24.0
 
 static const double NODE[STAGES] = {0.0, 2. / 9, 1. / 3, 5. / 9, 2. / 3, 1.0, 1.0};
