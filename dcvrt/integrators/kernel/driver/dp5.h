@@ -1,42 +1,24 @@
-/* The explicit pair of orders 5 and 4 of Dormand and Prince, with its dense output of order 4.
+/* The explicit pair of rk54.h, with its dense output of order 4.
  *
- * J. R. Dormand, P. J. Prince, J. Comp. Appl. Math. 6 (1980) 19-26; dense output: E. Hairer, S. P. Norsett,
- * G. Wanner, Solving Ordinary Differential Equations I, section II.6. The last stage is the first of the next
- * step. A method gives the loop: method_prepare, method_restart, method_step, method_accept,
+ * The form of the dense output: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
+ * section II.6. A method gives the loop: method_prepare, method_restart, method_step, method_accept,
  * method_rate, method_dense and method_middle.
  */
 #ifndef DCVRT_METHOD_H
 #define DCVRT_METHOD_H
 
-enum { STAGES = 7 };
+#include "rk54.h"
+
 /* Exponents of the step control: error^-a times (error before)^b, for an error of order h^5; error^-c after
  * a step that is not taken. */
-#define CONTROL_NOW 0.14
+#define CONTROL_NOW 0.20
 #define CONTROL_BEFORE 0.08
 #define CONTROL_REJECTED 0.2
-/* Where the equations turn a corner inside a step - a limit that is smoothed over less than the step - the error can
- * be a hundred times its estimate, since the corner lies by chance between the stages. The last term of the dense
- * output sees it. On smooth solutions that term is of order h^4, the estimate of order h^5: at a tolerance it is
- * seldom above SMOOTH tolerance^(-1/5) tolerances, and what it is above them counts as error. */
+/* The last term of the dense output sees what the estimate does not: corners of the equations between the stages -
+ * limits that are smoothed over less than the step - and a decay so fast that the step lies where the estimate
+ * vanishes. On smooth solutions that term is of order h^4, the estimate of order h^5: at a tolerance it is seldom
+ * above SMOOTH tolerance^(-1/5) tolerances, and what it is above them counts as error. */
 #define SMOOTH 24.0
-
-static const double NODE[STAGES] = {0.0, 1. / 5, 3. / 10, 4. / 5, 8. / 9, 1.0, 1.0};
-static const double A[STAGES][STAGES - 1] = {
-    {0},
-    {1. / 5},
-    {3. / 40, 9. / 40},
-    {44. / 45, -56. / 15, 32. / 9},
-    {19372. / 6561, -25360. / 2187, 64448. / 6561, -212. / 729},
-    {9017. / 3168, -355. / 33, 46732. / 5247, 49. / 176, -5103. / 18656},
-    {35. / 384, 0.0, 500. / 1113, 125. / 192, -2187. / 6784, 11. / 84},
-};
-static const double ERROR[STAGES] = {71. / 57600,      0.0,       -71. / 16695, 71. / 1920,
-                                     -17253. / 339200, 22. / 525, -1. / 40};
-static const double LAST_TERM[STAGES] = {
-    -12715105075. / 11282082432., 0.0,
-    87487479700. / 32700410799.,  -10690763975. / 1880347072.,
-    701980252875. / 199316789632., -1453857185. / 822651844.,
-    69997945. / 29380423.};
 
 struct method {
     real k[STAGES][NX], last[NX]; /* last: of the dense output */

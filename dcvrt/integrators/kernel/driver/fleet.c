@@ -79,6 +79,7 @@ struct fleet {
     struct course *course[LANES];
     long loaded[LANES], first_piece[LANES], last_piece[LANES], number[LANES];
     int spans[LANES], last[LANES], live[LANES];
+    int refused[LANES]; /* whether the last try of a step was refused: the next does not grow */
     enum seen seen[LANES]; /* on the last step */
     double wanted[LANES], step[LANES], trend[LANES];
 };

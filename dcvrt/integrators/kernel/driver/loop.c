@@ -130,6 +130,7 @@ static void load_lane(struct fleet *f, int lane)
     }
     f->wanted[lane] = first_step(c, rate, fmin(c->limit - c->t, c->options->longest));
     f->trend[lane] = 0.0;
+    f->refused[lane] = 0;
 }
 
 /* Whether the step of a lane leaves the piece of the inputs that is loaded. */
@@ -164,7 +165,8 @@ static int judge_step(struct fleet *f, int lane, double error)
     if (error <= 1.0) {
         double now = rough_log2(higher(error, 1e-10)), factor;
         factor = 0.9 * rough_exp2(CONTROL_BEFORE * f->trend[lane] - CONTROL_NOW * now);
-        factor = lower(6.0, higher(0.2, factor));
+        factor = lower(f->refused[lane] ? 1.0 : 6.0, higher(0.2, factor));
+        f->refused[lane] = 0;
         f->trend[lane] = higher(now, -13.0);
         /* a step that was cut by a limit says little about the size that is possible */
         f->wanted[lane] = f->last[lane] || h < f->wanted[lane] ? higher(h * factor, f->wanted[lane]) : h * factor;
@@ -173,6 +175,7 @@ static int judge_step(struct fleet *f, int lane, double error)
         return 1;
     }
     c->rejected++;
+    f->refused[lane] = 1;
     int finite = isfinite(error);
     f->wanted[lane] = h * (finite ? higher(0.2, 0.9 * rough_exp2(-CONTROL_REJECTED * rough_log2(error))) : 0.25);
     if (f->wanted[lane] < 4e-16 * fmax(1.0, fabs(c->t)))
