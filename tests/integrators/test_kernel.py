@@ -7,7 +7,7 @@ import pickle
 import platform
 import re
 from functools import cache
-from math import acos, cos, exp, sin, sqrt
+from math import acos, cos, exp, hypot, sin, sqrt
 
 import casadi as ca
 import numpy as np
@@ -100,7 +100,7 @@ def test_a_corner_between_the_stages_of_a_step_is_seen() -> None:
 
 
 def steps_of(monkeypatch: pytest.MonkeyPatch, h: float, until: float) -> tuple[KernelRun, float]:
-    """A run whose steps are all h long, since every error is accepted; error of x at the end."""
+    """A run whose steps are all h long, since every error is accepted; error of its state at the end."""
 
     def options(self: KernelModel, save_at: float, samples: bool) -> Options:
         return Options(1e6, 1e6, 1e6, 1.0, save_at, h, 1.0, 100_000, samples, samples, 0)
@@ -111,7 +111,8 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, h: float, until: float) -> tuple[K
     trajectory = run.trajectory(("omega",), "")
     sizes = np.array([run.record.step_h[k] for k in range(run.record.steps)])
     assert (sizes > 0.99 * h).mean() > 0.7  # the others grow to it
-    return run, float(abs(trajectory["x_out"][-1] - cos(5 * until)))
+    x, w = (float(trajectory[n][-1]) for n in ("x", "w"))
+    return run, hypot(x - cos(5 * until), w + sin(5 * until))  # of x alone changes its sign on the way
 
 
 def test_order_of_steps_is_five(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,12 +208,12 @@ def test_runs_events_and_sensitivities_are_those_of_the_other_backend(mode: str)
 
 @pytest.mark.parametrize("mode", MODES)
 def test_sensitivities_are_in_the_error_norm(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 1e-6 they are right to a thousandth at worst; left out of the norm, to no more than a hundredth."""
+    """At 1e-5 they are right to a thousandth at worst; left out of the norm, to no more than a hundredth."""
     signals = ("v_it", "p_g", "w_dc", "p_b")
-    run, tight = (simulator(mode, r, THETAS)(wave(), beta=1.15) for r in (1e-6, 1e-10))
+    run, tight = (simulator(mode, r, THETAS)(wave(), beta=1.15) for r in (1e-5, 1e-10))
     assert run.sequence == tight.sequence
     monkeypatch.setattr(kernel_run, "THETA_LOOSER", 1e30)
-    without = simulator(mode, 1e-6, THETAS)(wave(), beta=1.15)
+    without = simulator(mode, 1e-5, THETAS)(wave(), beta=1.15)
     errors, worse = ([off(r, tight, signals, theta) for theta in THETAS] for r in (run, without))
     assert max(errors) < 1e-3
     assert max(worse) > 1e-2
