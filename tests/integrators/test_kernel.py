@@ -96,6 +96,28 @@ def test_a_corner_between_the_stages_of_a_step_is_seen() -> None:
     assert errors.max() < 100 * rtol
 
 
+# -- stability ----------------------------------------------------------------------------------------------
+
+
+def follower() -> Dae:
+    """y' = -lam (y - x), with x the sine of om t and lam in 1/ms; y_out is how far y is off where it settles."""
+    om = 3.0
+    s = Sketch({"x": 0.0, "w": 1.0, "y": 0.0}, {"lam": 0.2})
+    x, w, y, lam = s.x["x"], s.x["w"], s.x["y"], 1e3 * s.p["lam"]
+    settled = lam * (lam * x - om * w) / (lam**2 + om**2)
+    return s.dae({"x": om * w, "w": -om * x, "y": -lam * (y - x)}, {"y_out": y - settled})
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7, 1e-9])
+def test_steps_at_the_border_of_stability_leave_no_error_behind(rtol: float) -> None:
+    """A lag of 0.5 to 17 ms bounds the step, not the error. Where the estimate vanishes a step grows what is
+    there 13 times: what is left of it stays within a few tens of tolerances."""
+    simulate = Simulator(follower(), Kernel("dp5", rtol, rtol * 1e-2), start="given")
+    for lam in (0.06, 0.137, 0.2, 0.35, 0.8, 2.0):
+        run = simulate(flat(6.0), lam=lam)
+        assert abs(run["y_out"][run.t > 1.0]).max() < 60 * rtol
+
+
 # -- order --------------------------------------------------------------------------------------------------
 
 

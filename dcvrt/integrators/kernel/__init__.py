@@ -16,10 +16,10 @@ class Kernel:
 
     Parameters
     ----------
-    method : ``dp5``, the explicit pair of orders 5 and 4 of Dormand and Prince, for systems without algebraic
-        variables; ``rosenbrock``, the linearly implicit, L-stable pair Rodas5P of orders 5 and 4, for stiff
-        systems and those with algebraic variables (index 1). By default the first where it can be, else the
-        second.
+    method : ``dp5``, the explicit pair of orders 5 and 4 of Dormand and Prince with the wide region of
+        stability (RK5(4)7S), for systems without algebraic variables; ``rosenbrock``, the linearly implicit,
+        L-stable pair Rodas5P of orders 5 and 4, for stiff systems and those with algebraic variables
+        (index 1). By default the first where it can be, else the second.
     rtol, atol : relative and absolute tolerance of every state and algebraic variable. Sensitivities take
         part in the error control with ten times the relative tolerance, against their own size and a tenth
         of their column's.
