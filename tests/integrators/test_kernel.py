@@ -100,7 +100,7 @@ def test_a_corner_between_the_stages_of_a_step_is_seen() -> None:
 
 
 def follower() -> Dae:
-    """y' = -lam (y - x), with x the sine of om t and lam in 1/ms; y_out is how far y is off where it settles."""
+    """y' = -lam (y - x), x = sin(om t), lam in 1/ms; y_out is how far y is off where it settles."""
     om = 3.0
     s = Sketch({"x": 0.0, "w": 1.0, "y": 0.0}, {"lam": 0.2})
     x, w, y, lam = s.x["x"], s.x["w"], s.x["y"], 1e3 * s.p["lam"]
