@@ -138,7 +138,7 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    headers = ("fleet.h", "pair.h", "run.h", "voltages.h", "steps.h", "events.h")
+    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "voltages.h", "steps.h", "events.h")
     files = _files(*headers, "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
