@@ -119,8 +119,8 @@ def test_the_region_of_stability_is_wide_and_the_dense_output_stays_within() -> 
 
 
 def test_the_error_estimate_sees_everything_that_the_step_may_reach() -> None:
-    """It vanishes at -7.08, where a step grows 13 times: the grid's driver keeps off by its limit of 5.3, that
-    of facilities by the last term of the dense output."""
+    """It vanishes at -7.08, where a step grows 13 times: the grid's driver keeps off by its limit of 5.3,
+    that of facilities by the last term of the dense output."""
     estimate = polynomial(B) - polynomial(EMBEDDED)
     (limit,) = re.findall(r"#define REACH ([0-9.]+)", GRID)
     zeros = np.roots(np.trim_zeros(estimate[::-1], "f"))
