@@ -24,9 +24,6 @@ Phasors = npt.NDArray[np.complex128]
 LEVEL = 0.02
 """Hours whose load lies within so much of the reference load share one Jacobian."""
 MOST_LEVELS = 60
-FEW = 20
-"""Hours up to which a known Jacobian is taken from up to `NEARBY` levels away."""
-NEARBY = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,13 +365,11 @@ class PowerFlow:
 
     def _steering(self, level: int, v: Phasors) -> Steering:
         """The steering of a load level, made at the mean voltages of some hours when it is first needed."""
-        known = min(self._steerings, key=lambda other: abs(other - level), default=None)
-        if known is not None and abs(known - level) <= (NEARBY if v.shape[1] <= FEW else 0):
-            return self._steerings[known]
-        if len(self._steerings) > MOST_LEVELS:
-            self._steerings.clear()
-        jacobian = self._jacobian(v.mean(axis=1), self._chord.moving)
-        self._steerings[level] = Steering(jacobian, len(self.free) + len(self.pq))
+        if level not in self._steerings:
+            if len(self._steerings) > MOST_LEVELS:
+                self._steerings.clear()
+            jacobian = self._jacobian(v.mean(axis=1), self._chord.moving)
+            self._steerings[level] = Steering(jacobian, len(self.free) + len(self.pq))
         return self._steerings[level]
 
     def sensitivities(
