@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.grid.network import Network
+from dcvrt.grid.network import DENSE, Network
 from dcvrt.planning.master import TOLERANCE, highs
 from dcvrt.planning.security import Outages
 
@@ -143,6 +143,8 @@ class HourDispatch:
         shortfall = float(x[n : n + 3].sum())
         if shortfall > 0:
             return Dispatched(shortfall, x[:n], self._dual(row_dual))
+        if len(self.network.bus) > DENSE:  # the second run takes longer than it saves
+            return Dispatched(0.0, x[:n], None)
         self._room(-ROOM, 0.0)
         x, _ = self._least(fixed, demand, tolerance)
         self._room(0.0, self._inf)
