@@ -211,7 +211,8 @@ class HostingProblem:
         return self._answer(question, thorough)
 
     def allows(self, hosting: Mapping[int, float]) -> bool:
-        """Whether every hour has a dispatch and AC voltages within all limits at these capacities.
+        """Whether these capacities are sizes that sites may have, and every hour has a dispatch and AC
+        voltages within all limits at them.
 
         What is found to be wrong is kept, so that `solve` knows it from then on.
 
@@ -226,7 +227,10 @@ class HostingProblem:
             When something names no site, is negative or not finite.
         """
         raise_all(hosting_faults(hosting, self.sites), "capacities")
-        H = np.maximum([hosting.get(bus, 0.0) - SETTLED for bus in self.sites], 0.0)
+        given = np.array([hosting.get(bus, 0.0) for bus in self.sites])
+        if ((given > 0) & ((given < self.lower - SETTLED) | (given > self.upper + SETTLED))).any():
+            return False
+        H = np.maximum(given - SETTLED, 0.0)
         hours, screen = self.certifier, self.screen
         cut = hours.certify(H)
         if cut is not None:

@@ -346,6 +346,15 @@ def test_a_range_below_the_least_size_closes_a_site() -> None:
         problem.solve(bounds={75: (10.0, 24.0)})
 
 
+def test_only_sizes_that_a_site_may_have_are_allowed() -> None:
+    problem = HostingProblem(
+        NETWORK, SITES, YEAR, rating_scale=0.6, h_max=60.0, min_size=25.0, reactive_limits=False
+    )
+    assert problem.allows({75: 25.0, 106: 0.0})
+    assert not problem.allows({75: 24.9})
+    assert not problem.allows({75: 60.1})
+
+
 def test_the_solver_of_the_programmes_is_silent() -> None:
     """What a C library prints would stand in the output of `--json`."""
     code = "from dcvrt.planning.master import highs; highs().run()"
