@@ -2,7 +2,7 @@
  *
  * The form of the dense output: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
  * section II.6. A method gives the loop: method_prepare, method_restart, method_step, method_accept,
- * method_rate, method_dense and method_middle.
+ * method_rate, method_dense, method_middle and method_reach.
  */
 #ifndef DCVRT_METHOD_H
 #define DCVRT_METHOD_H
@@ -23,11 +23,20 @@
  * above SMOOTH tolerance^(-1/5) tolerances, and what it is above them counts as error. */
 #define SMOOTH 24.0
 
+/* At rest nothing else tells of a decay too fast for the step, and what it leaves grows where the estimate vanishes.
+ * The last two stages are at one instant: where their rates differ against their states in proportion, the factor is
+ * that of the fastest decay, and the next step is no longer than REACH over it. A turning motion shows no such
+ * proportion, however its states are scaled. Differences below STILL tolerances are not asked. */
+#define REACH 5.3
+#define STILL 0.01
+#define PROPORTION 0.9 /* square of the cosine between them */
+
 struct method {
     real k[STAGES][NX], last[NX]; /* last: of the dense output */
     column ks[STAGES][AT_LEAST_ONE(GROUPS * NX)], lasts[AT_LEAST_ONE(GROUPS * NX)];
     real corner; /* share of an error that the last term is, see SMOOTH; of sensitivities */
     column theta_corner;
+    real decay; /* fastest that the last step showed, or 0 */
 };
 
 /* State for stage s; s is a constant where this is called, so that the sum is unrolled. */
@@ -62,6 +71,30 @@ static void method_prepare(struct fleet *f, const struct options *o)
     f->method->theta_corner = all_columns(pow(o->theta_rtol, 0.2) / SMOOTH);
 }
 
+/* Fastest decay that the last two stages show. */
+static real fastest_decay(const struct fleet *f)
+{
+    const struct method *w = f->method;
+    real xx = all_lanes(0.0), xk = xx, kk = xx;
+    for (int i = 0; i < NX; i++) {
+        real weight = 1.0 / (f->atol + f->rtol * absolute(f->x1[i]));
+        real dx = weight * (f->x1[i] - f->stage_x[i]), dk = weight * (w->k[STAGES - 1][i] - w->k[STAGES - 2][i]);
+        xx += dx * dx;
+        xk -= dx * dk;
+        kk += dk * dk;
+    }
+    real shown = both(both(is_less(all_lanes(STILL * STILL), xx), is_less(all_lanes(0.0), xk)),
+                      is_less(PROPORTION * xx * kk, xk * xk));
+    return where(shown, xk / larger(xx, all_lanes(STILL * STILL)));
+}
+
+/* How long the next step of a lane may be. */
+static double method_reach(const struct fleet *f, int lane)
+{
+    double decay = AT(f->method->decay, lane);
+    return decay > 0 ? REACH / decay : INFINITY;
+}
+
 /* One step of every lane from f->x over f->h to f->x1; the error of each over its tolerance. */
 static real method_step(struct fleet *f)
 {
@@ -72,6 +105,7 @@ static real method_step(struct fleet *f)
     stage(f, 4);
     stage(f, 5);
     stage(f, 6);
+    w->decay = fastest_decay(f);
     real error[NX];
     column errors[AT_LEAST_ONE(GROUPS * NX)];
     for (int i = 0; i < NX; i++) {

@@ -170,6 +170,7 @@ static int judge_step(struct fleet *f, int lane, double error)
         f->trend[lane] = higher(now, -13.0);
         /* a step that was cut by a limit says little about the size that is possible */
         f->wanted[lane] = f->last[lane] || h < f->wanted[lane] ? higher(h * factor, f->wanted[lane]) : h * factor;
+        f->wanted[lane] = lower(f->wanted[lane], method_reach(f, lane));
         c->accepted++;
         if (c->accepted + c->rejected > o->max_steps) return course_fail(c, TOO_MANY_STEPS, c->t, t1), 0;
         return 1;

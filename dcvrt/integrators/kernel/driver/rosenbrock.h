@@ -276,4 +276,11 @@ static const real *method_rate(struct fleet *f)
     return f->method->rate;
 }
 
+/* How long the next step of a lane may be: nothing decays too fast. */
+static double method_reach(const struct fleet *f, int lane)
+{
+    (void)f, (void)lane;
+    return INFINITY;
+}
+
 #endif
