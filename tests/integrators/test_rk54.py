@@ -120,8 +120,8 @@ def test_the_region_of_stability_is_wide_and_the_dense_output_stays_within() -> 
 
 
 def test_the_error_estimate_sees_everything_that_the_step_may_reach() -> None:
-    """It vanishes at -7.08, where a step grows 13 times: both drivers keep off by their limit of 5.3, and by the
-    last term of the dense output where slow motion hides the fast."""
+    """It vanishes at -7.08, where a step grows 13 times: both drivers keep off by their limit of 5.3, and by
+    the last term of the dense output where slow motion hides the fast."""
     estimate = polynomial(B) - polynomial(EMBEDDED)
     (limit,), (alone,) = (re.findall(r"#define REACH ([0-9.]+)", text) for text in (GRID, ALONE))
     assert alone == limit
