@@ -69,9 +69,9 @@ def system_limit(findings: Findings) -> Safe:
                 alt=f"Hosted capacity against the load lost at once. {' '.join(said)}",
                 caption=(
                     "Hosted capacity against the load lost at once in the worst fault, by the replay. Each "
-                    "mark is a plan; lines between them guide the eye. Limits in MW and as a share of the "
-                    "load lie on the same curve. Open marks: plans whose every site rides through, at what "
-                    "they lose."
+                    "mark is a plan; steps between them, since a larger limit allows it too. Limits in MW "
+                    "and as a share of the load lie on the same curve. Open marks: plans whose every site "
+                    "rides through, at what they lose."
                 ),
             )
         )
