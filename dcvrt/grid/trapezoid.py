@@ -31,8 +31,8 @@ Integers = npt.NDArray[np.int64]
 TOLERANCE = 1e-6
 """Largest correction of any variable that the solution of an event may still make, pu or rad."""
 LEFT = 1e-7
-"""Largest error of any variable that may be left in a step, pu or rad. Fifty times as much would leave voltages
-right to 1e-6 pu in most cases, but near a limit it decides whether a limiter acts."""
+"""Largest error of any variable that may be left in a step, pu or rad. Fifty times as much would leave
+voltages right to 1e-6 pu in most cases, but near a limit it decides whether a limiter acts."""
 ITERATIONS = 12
 EVENT_ITERATIONS = 60
 SLOW = 0.05
