@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 OK, INTERNAL, BAD_INPUT, INFEASIBLE, INCOMPLETE = range(5)
+MOST_COLUMNS = 6
+"""Sites that have a column each in the table of plans; more share one."""
 
 app = typer.Typer(
     name="dcvrt",
@@ -122,6 +124,11 @@ def study_schema() -> None:
     print(schema())
 
 
+def _open_sites(row: dict[str, Any], sites: list[str]) -> str:
+    """Sites that host anything, with their capacity, in one cell."""
+    return ", ".join(f"{c[4:-3]}: {row[c]:.1f}" for c in sites if row[c] > 0)
+
+
 def _show(result: object) -> None:
     """Print the table of plans and where the rest is; say what is missing and end with code 4 if anything
     is."""
@@ -133,10 +140,21 @@ def _show(result: object) -> None:
     assert isinstance(result, Result)
     frame = result.table()
     sites = [str(column) for column in frame if str(column).startswith("bus_")]
+    by_column = len(sites) <= MOST_COLUMNS
+    names = [f"bus {c[4:-3]}" for c in sites] if by_column else ["sites, MW"]
     shown = Table()
-    for heading in ("method", "mode", "beta", "MW", *[f"bus {c[4:-3]}" for c in sites], "replay",
-                    "V margin, pu", "loss margin, MW", "AC"):  # fmt: skip
-        shown.add_column(heading, no_wrap=True)
+    for heading in (
+        "method",
+        "mode",
+        "beta",
+        "MW",
+        *names,
+        "replay",
+        "V margin, pu",
+        "loss margin, MW",
+        "AC",
+    ):
+        shown.add_column(heading, no_wrap=by_column or heading != "sites, MW")
     for row in records(frame):
         verdict = {"failed": "[red]failed[/]", "passed": "[green]passed[/]"}.get(row["replay"], row["replay"])
         shown.add_row(
@@ -144,7 +162,7 @@ def _show(result: object) -> None:
             row["mode"],
             _number(row["beta"], "g"),
             _number(row["total_mw"], ".2f"),
-            *[_number(row[c], ".2f") for c in sites],
+            *([_number(row[c], ".2f") for c in sites] if by_column else [_open_sites(row, sites)]),
             verdict,
             _number(row["worst_voltage_margin_pu"], ".4f"),
             _number(row["worst_loss_margin_mw"], ".2f"),

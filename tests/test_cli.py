@@ -404,3 +404,10 @@ def test_each_kind_of_error_has_its_exit_code(
     monkeypatch.setattr(facility, "names", fail)
     assert run("facility", "list") == code
     assert capsys.readouterr().err == f"{error}\n"
+
+
+def test_many_sites_share_a_column() -> None:
+    from dcvrt.cli import _open_sites
+
+    row = {"bus_2_mw": 0.0, "bus_17_mw": 12.34, "bus_75_mw": 104.96}
+    assert _open_sites(row, list(row)) == "17: 12.3, 75: 105.0"
