@@ -121,6 +121,22 @@ def site_colour(site: int, sites: Sequence[int]) -> str:
     return PALETTE[list(sites).index(site) % len(PALETTE)]
 
 
+def site_marker(site: int, sites: Sequence[int]) -> str:
+    """Marker of a candidate bus; where colours come round again, a marker beside another colour."""
+    return MARKERS[_turned(site, sites, len(MARKERS))]
+
+
+def site_hatch(site: int, sites: Sequence[int]) -> str:
+    """Hatch of a candidate bus; where colours come round again, a hatch beside another colour."""
+    return HATCHES[_turned(site, sites, len(HATCHES))]
+
+
+def _turned(site: int, sites: Sequence[int], count: int) -> int:
+    """Place among `count` shapes, one further after each round of the colours."""
+    k = list(sites).index(site)
+    return (k + k // len(PALETTE)) % count
+
+
 def mode_name(mode: str) -> str:
     """What a reader calls a variant: the paper's abbreviations in capitals, other names as they are.
 

@@ -373,3 +373,12 @@ def test_best_plan_has_passed_everything(folder: Path) -> None:
     assert best["ac"]["passed"]
     larger = [r for r in findings.rows() if r["total_mw"] > best["total_mw"] + findings.tolerance_mw]
     assert all(verdict(r) == "failed" for r in larger)
+
+
+def test_thirty_sites_are_told_apart() -> None:
+    """Colours come round again; colour with hatch and colour with marker do not."""
+    from dcvrt.studies.style import site_colour, site_hatch, site_marker
+
+    sites = list(range(100, 130))
+    assert len({(site_colour(s, sites), site_hatch(s, sites)) for s in sites}) == len(sites)
+    assert len({(site_colour(s, sites), site_marker(s, sites)) for s in sites}) == len(sites)

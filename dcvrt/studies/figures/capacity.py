@@ -10,7 +10,6 @@ from dcvrt.studies.rows import Row, by_site, verdict
 from dcvrt.studies.style import (
     FAILED,
     GREY,
-    HATCHES,
     INK,
     PAGE,
     letters,
@@ -20,6 +19,7 @@ from dcvrt.studies.style import (
     new_figure,
     panel,
     site_colour,
+    site_hatch,
 )
 
 if TYPE_CHECKING:
@@ -99,10 +99,7 @@ def draw_allocation(findings: Findings) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("converter rating over capacity, β")
     panels[0, 0].set_ylim(0, 1.15 * max([findings.no_vrt_mw] + [row["total_mw"] for row in findings.rows()]))
-    handles = [
-        _patch(site_colour(site, sites), HATCHES[k % len(HATCHES)], f"bus {site}")
-        for k, site in enumerate(sites)
-    ]
+    handles = [_patch(site_colour(site, sites), site_hatch(site, sites), f"bus {site}") for site in sites]
     extra = panels[0, 0].get_legend_handles_labels()[0]
     figure.legend(
         handles=handles + extra, loc="outside lower center", ncols=min(6, len(handles) + len(extra))
@@ -140,7 +137,7 @@ def _stack(axes: Axes, findings: Findings, mode: str, method: str) -> None:
             width,
             bottom=floor,
             color=site_colour(site, sites),
-            hatch=HATCHES[k % len(HATCHES)],
+            hatch=site_hatch(site, sites),
             edgecolor="white",
             linewidth=0.4,
         )

@@ -8,7 +8,7 @@ import numpy as np
 
 from dcvrt.planning.replay import fault_label
 from dcvrt.studies.findings import Findings
-from dcvrt.studies.style import GREY, INK, MARKERS, PAGE, new_figure, site_colour
+from dcvrt.studies.style import GREY, INK, PAGE, new_figure, site_colour, site_marker
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,7 +50,7 @@ def draw(findings: Findings) -> Figure:
             rows["median"],
             y,
             linestyle="none",
-            marker=MARKERS[k % len(MARKERS)],
+            marker=site_marker(site, sites),
             color=colour,
             markersize=4.2,
             label=f"bus {site}",
@@ -85,5 +85,5 @@ def draw(findings: Findings) -> Figure:
         linestyle=(0, (3, 2)),
         label="static limit of the load loss for a rating β",
     )
-    figure.legend(loc="outside lower center", ncols=len(sites) + 1)
+    figure.legend(loc="outside lower center", ncols=min(6, len(sites) + 1))
     return figure
