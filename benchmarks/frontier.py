@@ -39,7 +39,9 @@ def run(smoke: bool = False) -> list[Result]:
     setting = _setting(smoke)
     for mode in setting.file.facility.modes:
         for gradients in (False, True):
-            replay.prepare(_request(setting, [0.0] * 4, "peak", [(mode, 1.2)], gradients))
+            request = _request(setting, [0.0] * 4, "peak", [(mode, 1.2)], gradients)
+            replay.prepare_facility(request)
+            replay.prepare_grid(request)
     spent = Counter(setting)
 
     start = time.perf_counter()

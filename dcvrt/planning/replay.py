@@ -151,9 +151,11 @@ def fault_label(fault: Mapping[str, Any]) -> str:
     return fault_of(fault).label
 
 
-def prepare(request: Mapping[str, Any]) -> str:
-    """Make what is made once per machine: the grid simulator's code, the compiled facility of the request's
-    first mode; and try the values of its runs.
+def prepare_facility(request: Mapping[str, Any]) -> str:
+    """Compile the facility of the request's first mode, once per machine; and try the values of its runs.
+
+    A run at rest compiles what runs through faults will need, with the margins and derivatives that the
+    request asks for.
 
     Returns
     -------
@@ -166,16 +168,12 @@ def prepare(request: Mapping[str, Any]) -> str:
         When the compiler fails, or a facility does not take a rating, the power factor or the data-centre
         factor of the request.
     """
-    from dcvrt.grid import andes
+    from dcvrt.waveform import Waveform
 
-    grid = _grid_of(request)
-    if request["engine"] == "andes":
-        andes.prepare()
-    else:
-        _ = grid.native.system.layout  # compiles now
-    mode = request["runs"][0][0]
-    simulator = simulator_of(mode, {}, thetas(request))
-    for beta in [beta for m, beta in request["runs"] if m == mode]:
+    mode, wrt = request["runs"][0][0], thetas(request)
+    simulator = simulator_of(mode, {}, wrt)
+    betas = [float(beta) for m, beta in request["runs"] if m == mode]
+    for beta in betas:
         simulator.dae.parameter_values(
             **request["parameters"].get(mode, {}),
             H=1.0,
@@ -183,7 +181,25 @@ def prepare(request: Mapping[str, Any]) -> str:
             d=request["period"]["dc_factor"],
             pf=float(request["pf"]),
         )
-    return simulator.backend
+    rest = Waveform.from_samples([0.0, request["t_end_s"]], [1.0, 1.0], {q: [0.0, 0.0] for q in wrt[1:]})
+    facility_rows(request, mode, [max(betas)], {"none": {request["sites"][0]: rest}})
+    return simulator_of(mode, {}).backend
+
+
+def prepare_grid(request: Mapping[str, Any]) -> None:
+    """Make the code of the request's grid simulator, once per machine.
+
+    Raises
+    ------
+    InputError
+        When the compiler fails or the cache cannot be written.
+    """
+    from dcvrt.grid import andes
+    from dcvrt.grid.native.build import network_library
+
+    andes.prepare()  # reads the cases of both engines
+    if request["engine"] == "native":
+        _ = network_library(), _grid_of(request).native.system.layout  # compiles now
 
 
 def simulator_of(mode: str, parameters: Mapping[str, float], wrt: tuple[str, ...] = ()) -> Simulator:
@@ -363,6 +379,7 @@ def _grid(
 def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...], wrt: tuple[str, ...]) -> Simulator:
     from dcvrt import facility
     from dcvrt.integrators import NoCompilerWarning, Simulator
+    from dcvrt.integrators.compiler import find_compiler, say_interpreted
 
     diagram = facility.get(mode)
     for path, value in parameters:
@@ -370,7 +387,8 @@ def _simulator(mode: str, parameters: tuple[tuple[str, Any], ...], wrt: tuple[st
     simulator = Simulator(diagram.compile(), wrt=wrt, save_at=SAVE_AT)
     with warnings.catch_warnings():  # whoever starts a study is told by `prepare`, not by every worker
         warnings.simplefilter("ignore", NoCompilerWarning)
-        simulator.backend  # noqa: B018 - compiles now
+        if find_compiler() is None:
+            say_interpreted()
     return simulator
 
 

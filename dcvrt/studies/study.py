@@ -255,11 +255,13 @@ class Result:
     def report(self) -> list[Path]:
         """Write tables, figures and report again from the store; the files written."""
         from dcvrt.studies.figures import draw_all
+        from dcvrt.studies.findings import Findings
         from dcvrt.studies.report import write_report
 
         with Store(self.folder / outputs.STORE) as store:
             files = outputs.write_results(self.folder, store)
-        return [*files, *draw_all(self.folder), write_report(self.folder)]
+        findings = Findings(self.folder)
+        return [*files, *draw_all(findings), write_report(findings)]
 
 
 def _facility(mode: str, parameters: Mapping[str, float]) -> ParameterTable:
@@ -286,22 +288,33 @@ def versions() -> dict[str, str]:
 def prepare(file: StudyFile, setting: Setting) -> dict[str, str]:
     """Let what is generated once per machine be generated here, before workers would do it at the same time.
 
+    ANDES generates its code meanwhile, which takes one processor for as long as all facilities do.
+
     Returns
     -------
     dict
         How the facility of each mode is evaluated: the compiler, or the interpreter.
     """
+    from concurrent.futures import ThreadPoolExecutor
+
+    from dcvrt.grid import andes
     from dcvrt.planning import replay
 
-    backends = {}
-    for mode in file.facility.modes:
-        runs = [(mode, beta) for beta in file.facility.beta]
-        for period in setting.periods:
-            zero = [0.0] * len(setting.sites)
-            if file.frontier.search or file.sampling.gradients:
-                replay.prepare(setting.request(zero, period, runs, engine=file.grid.engine, gradients=True))
-            for engine in (file.grid.engine, file.replay.engine):
-                backends[mode] = replay.prepare(setting.request(zero, period, runs, engine=engine))
+    zero, backends = [0.0] * len(setting.sites), {}
+    engines = {file.grid.engine, file.replay.engine}
+    with ThreadPoolExecutor(1) as beside:
+        code = beside.submit(andes.prepare)
+        for mode in file.facility.modes:
+            runs = [(mode, beta) for beta in file.facility.beta]
+            for period in setting.periods:
+                for gradients in {file.frontier.search or file.sampling.gradients, False}:
+                    request = setting.request(
+                        zero, period, runs, engine=file.grid.engine, gradients=gradients
+                    )
+                    backends[mode] = replay.prepare_facility(request)
+        code.result()
+    for engine in sorted(engines):
+        replay.prepare_grid(setting.request(zero, next(iter(setting.periods)), [], engine=engine))
     return backends
 
 

@@ -96,6 +96,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     svg, png = folder / f"{name}.svg", folder / f"{name}.png"
     figure.savefig(svg, metadata={"Date": None, "Creator": "dcvrt", "Format": None, "Type": None})
+    figure.set_layout_engine("none")  # stays as it was laid out: that takes as long as drawing
     figure.savefig(png, metadata={"Software": "dcvrt"})
     return [svg, png]
 

@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drawn(folder: Path) -> list[Path]:
     (folder / "figures").mkdir()
     (folder / "figures" / "old.svg").write_text("<svg/>", encoding="utf-8")
-    return draw_all(folder)
+    return draw_all(Findings(folder))
 
 
 def texts_of(figure: object) -> list[str]:
@@ -86,7 +86,7 @@ def test_svg_is_well_formed_and_refers_to_nothing_outside(drawn: list[Path]) -> 
 
 def test_the_same_study_gives_the_same_bytes(folder: Path, drawn: list[Path]) -> None:
     before = {p: p.read_bytes() for p in drawn}
-    assert {p: p.read_bytes() for p in draw_all(folder)} == before
+    assert {p: p.read_bytes() for p in draw_all(Findings(folder))} == before
 
 
 def test_no_text_is_smaller_than_can_be_read_in_print(folder: Path) -> None:
@@ -118,7 +118,7 @@ def test_nothing_sticks_out_of_its_figure(folder: Path) -> None:
 
 def test_unfinished_study_is_refused_with_the_way_out(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
-        draw_all(tmp_path)
+        draw_all(Findings(tmp_path))
     assert str(error.value) == (
         f"{tmp_path}: summary.json and study.sqlite not found, so this is not the folder of a study that has "
         "ended. Way out: run 'dcvrt study run' with this folder as --out; it resumes."

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dcvrt.studies.figures import draw_all
+from dcvrt.studies.findings import Findings
 from dcvrt.studies.report import write_report
 from dcvrt.studies.study import Result
 from tests.studies.synthetic import make
@@ -19,12 +20,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_figure_is_drawn_without_a_warning(folder: Path) -> None:
-    drawn = {path.stem for path in draw_all(folder)}  # warnings are errors here
+    drawn = {path.stem for path in draw_all(Findings(folder))}  # warnings are errors here
     assert {"capacity", "allocation", "validation", "retained_voltage", "network_map", "framework"} <= drawn
 
 
 def test_the_report_says_that_nothing_could_be_simulated(folder: Path) -> None:
-    text = write_report(folder).read_text(encoding="utf-8")
+    text = write_report(Findings(folder)).read_text(encoding="utf-8")
     runs = 16 * 2 * 4 * 4 * 2 * 4  # samples, periods, faults, sites, modes, ratings
     assert (
         f"Nothing could be simulated: none of the {runs} facility runs has a result, so that no hosted load "

@@ -62,14 +62,14 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = make(tmp_path_factory.mktemp("study"), lost=True, name=HOSTILE)
-    write_report(folder)
+    write_report(Findings(folder))
     return folder
 
 
 def page_of(study: Path, pictures: Path) -> Page:
     """The report of a study, with the pictures of another one, which saves the time to draw them."""
     shutil.copytree(pictures / "figures", study / "figures")
-    write_report(study)
+    write_report(Findings(study))
     return Page((study / "report.html").read_text(encoding="utf-8"))
 
 
@@ -187,7 +187,7 @@ def test_facility_without_a_response_is_told(
     for picture in (tmp_path / "figures").glob("internal_response_*"):
         picture.unlink()
     monkeypatch.setattr("dcvrt.integrators.Simulator.attempt", fails)
-    write_report(tmp_path)
+    write_report(Findings(tmp_path))
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert "GFL: no response to the test waveform: gfl: no equilibrium at the first value" in text
 
@@ -324,7 +324,7 @@ def test_forms_of_the_margins_stand_side_by_side(tmp_path: Path) -> None:
     assert len({form["feasible"] for form in forms.values()}) == 1
     assert all(0 <= form["kept"] <= form["feasible"] for form in forms.values())
     assert forms["bound"]["kept"] > 0
-    write_report(folder)
+    write_report(Findings(folder))
     page = (folder / "report.html").read_text(encoding="utf-8")
     table = page[page.index("What each form keeps of what is feasible") :]
     for form in forms.values():

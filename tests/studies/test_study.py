@@ -167,10 +167,10 @@ def test_values_that_no_run_takes_are_refused_before_the_first_task(tmp_path: Pa
         "pf": 0.98,
     }
     with pytest.raises(InputError) as caught:
-        replay.prepare(request | {"runs": [["gfl", 1.0]]})
+        replay.prepare_facility(request | {"runs": [["gfl", 1.0]]})
     assert str(caught.value) == "d = 0.05 is outside [0.1, 1.2]."
     with pytest.raises(InputError) as caught:
-        replay.prepare(request | {"period": {"dc_factor": 1.0}})
+        replay.prepare_facility(request | {"period": {"dc_factor": 1.0}})
     assert str(caught.value) == "beta = 9 is outside [0.8, 2]."
 
 

@@ -13,25 +13,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def draw_all(folder: Path) -> list[Path]:
+def draw_all(findings: Findings) -> list[Path]:
     """Draw every figure of a finished study as SVG and PNG into its folder `figures`.
 
     Parameters
     ----------
-    folder : study folder.
+    findings : of the study's folder.
 
     Returns
     -------
     list of Path
         What was written. Figures of earlier runs under other names are removed.
-
-    Raises
-    ------
-    InputError
-        When the folder holds no finished study.
     """
-    findings = Findings(Path(folder))
-    into = Path(folder) / "figures"
+    into = findings.folder / "figures"
     written: list[Path] = []
     with styled():
         for name, figure in _figures(findings):

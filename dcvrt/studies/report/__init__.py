@@ -50,26 +50,20 @@ SECTIONS: tuple[Callable[[Findings], Safe], ...] = (
 )
 
 
-def write_report(folder: Path) -> Path:
+def write_report(findings: Findings) -> Path:
     """Write `report.html` into the folder of a finished study; figures that are missing are drawn.
 
     Parameters
     ----------
-    folder : study folder.
+    findings : of the study's folder.
 
     Returns
     -------
     Path
         The report.
-
-    Raises
-    ------
-    InputError
-        When the folder holds no finished study.
     """
-    findings = Findings(Path(folder))
     if not (findings.folder / "figures" / "framework.svg").is_file():
-        draw_all(findings.folder)
+        draw_all(findings)
     return write_atomically(findings.folder / REPORT, text_of(findings))
 
 
