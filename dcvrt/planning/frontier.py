@@ -164,7 +164,8 @@ def _answer(
     questions = [(Ask(H, tuple(places)), everyone) for H, places in wanted.items()]
     for found in simulate(questions) if questions else ():
         _learn(known, searches, found)
-    asks = [(Ask(H, None), tuple(run for run in everyone if H not in known.replayed[run])) for H in replays]
+    # The faults take the time of a replay: what rides through them at other ratings is told as well.
+    asks = [(Ask(H, None), tuple(r for r in known.replayed if H not in known.replayed[r])) for H in replays]
     for (ask, _), found in zip(asks, replay(asks) if asks else [], strict=True):
         _keep(known, ask.H, found)
 

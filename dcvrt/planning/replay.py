@@ -26,16 +26,12 @@ if TYPE_CHECKING:
     from dcvrt.criteria import Criteria
     from dcvrt.grid import BusFault, Grid, Period
     from dcvrt.integrators import Simulator
-    from dcvrt.trajectory import Trajectory
     from dcvrt.waveform import Waveform
 
-SIGNALS = ("v_it", "p_g", "q_g", "i_g", "p_b", "soc", "w_dc", "p_out", "mode")
-"""Facility outputs that are kept of the worst cases."""
-SIGNAL_UNITS = {"v_it": "pu", "i_g": "pu", "soc": "1", "w_dc": "1", "mode": "1"}
 MAIN = ("sup", "control")
 """Blocks whose modes say how a facility is fed: a variant has one of them, or is fed in one way only."""
 SAVE_AT = 2e-3
-"""Distance of the samples that are kept, s."""
+"""Distance of the samples of a facility's run, s."""
 
 
 def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,8 +47,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         `runs`: [[mode, beta], ...]; `parameters`: {mode: {path: value}}; `criteria`: keywords of `Criteria`;
         `engine`: simulator of the faults, `native` or `andes`;
         `gradients`: True for the derivatives of every margin, with the native engine;
-        `keep`: True to give back the waveforms too: the voltages of all faults and, for each run, the
-        facility where its voltage margin and where its loss margin is least.
+        `keep`: True to give back the voltages of all faults too.
 
     Returns
     -------
@@ -70,7 +65,7 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
     the voltage, and through the facility into the margin. On its own base the facility does not change with
     its size, so there is no further term by the site's own H.
     """
-    hosting, period = hosting_of(request), period_of(request)
+    period = period_of(request)
     runs = [(mode, float(beta)) for mode, beta in request["runs"]]
     answer: dict[str, Any] = {"rows": [], "waveforms": [], "grid": 0, "facility": 0}
     found: dict[str, Mapping[int, Waveform]] = {}
@@ -85,33 +80,17 @@ def check_hosting(request: Mapping[str, Any]) -> dict[str, Any]:
         rows = facility_rows(request, mode, betas, found)
         answer["rows"] += rows
         answer["facility"] += len(rows)
-    if not request.get("keep", False):
-        return answer
-    answer["waveforms"] = [
-        {
-            "period": period.name,
-            "fault": label,
-            "site": site,
-            "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)},
-        }
-        for label, waveforms in found.items()
-        for site, w in waveforms.items()
-    ]
-    for mode, beta in runs:
-        for fault, site in _worst(answer["rows"], hosting, mode, beta):
-            run = simulator_of(mode, request["parameters"].get(mode, {}))(
-                found[fault][site], H=1.0, beta=beta, d=period.dc_factor, pf=float(request["pf"])
-            )
-            answer["waveforms"].append(
-                {
-                    "period": period.name,
-                    "fault": fault,
-                    "site": site,
-                    "mode": mode,
-                    "beta": beta,
-                    "signals": _signals(run),
-                }
-            )
+    if request.get("keep", False):
+        answer["waveforms"] = [
+            {
+                "period": period.name,
+                "fault": label,
+                "site": site,
+                "signals": {"t_s": w.t, "v_re_pu": np.real(w.v), "v_im_pu": np.imag(w.v)},
+            }
+            for label, waveforms in found.items()
+            for site, w in waveforms.items()
+        ]
     return answer
 
 
@@ -432,22 +411,3 @@ def _row(
         "diagnostics": {},
         "gradients": {},
     }
-
-
-def _worst(
-    rows: Sequence[Mapping[str, Any]], hosting: Mapping[int, float], mode: str, beta: float
-) -> list[tuple[str, int]]:
-    """Fault and site with the least voltage margin, and with the least loss margin, at sites that host
-    something."""
-    good = [r for r in rows if r["ok"] and (r["mode"], r["beta"]) == (mode, beta) and hosting[r["site"]] > 0]
-    if not good:
-        return []
-    worst = [min(good, key=lambda r: r[target]) for target in ("v_margin_pu", "loss_margin_mw")]
-    return list(dict.fromkeys((r["fault"], r["site"]) for r in worst))
-
-
-def _signals(run: Trajectory) -> dict[str, Any]:
-    kept = {"t_s": run.t}
-    for name in SIGNALS:
-        kept[f"{name}_{SIGNAL_UNITS.get(name, 'pu')}"] = run[name]
-    return kept

@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
     from dcvrt.dae import Dae
     from dcvrt.grid.network import Network
+    from dcvrt.integrators import Simulator
+    from dcvrt.trajectory import Trajectory
 
+SAVE_AT = 2e-3
+"""Distance of the samples of runs that are drawn, s."""
 SAME_SHARE = 1e-3
 """Capacities that differ by less than this share of the plan without ride-through count as equal."""
 
@@ -254,6 +258,18 @@ class Findings:
     def _facilities(self) -> dict[str, Dae]:
         return {}
 
+    def simulator(self, mode: str) -> Simulator:
+        """Runs the facility of a mode."""
+        from dcvrt.integrators import Simulator
+
+        if mode not in self._simulators:
+            self._simulators[mode] = Simulator(self.facility(mode), save_at=SAVE_AT)
+        return self._simulators[mode]
+
+    @cached_property
+    def _simulators(self) -> dict[str, Simulator]:
+        return {}
+
     def parameters(self, mode: str) -> dict[str, float]:
         """Parameters that the study sets for a mode, by path."""
         return {**self.study.facility.parameters, **self.study.facility.parameters_by_mode.get(mode, {})}
@@ -346,19 +362,12 @@ class Findings:
         return dict(found.iloc[0])
 
     def worst_case(self, mode: str | None = None) -> Case | None:
-        """The replayed run with the least margin, pu volts or share of import, whichever is less.
-
-        Among the runs whose facility waveforms were kept: for every plan, those where its voltage margin and
-        where its loss margin is least.
-        """
+        """The replayed run of a plan with the least margin, pu volts or share of import, whatever is less."""
         replayed = self.margins[(self.margins.ok == 1) & (self.margins.h_mw > 0)]
         # A vector is replayed for several modes and ratings, and is the plan of some of them.
         replayed = replayed.merge(self.plans[["hosting", "mode", "beta"]].drop_duplicates())
         if mode is not None:
             replayed = replayed[replayed["mode"] == mode]
-        kept = self._kept_runs
-        keys = replayed[list(Case.KEYS)].itertuples(index=False, name=None)
-        replayed = replayed[[tuple(key) in kept for key in keys]]
         if replayed.empty:
             return None
         least = replayed[["v_margin_pu", "loss_margin_share"]].min(axis=1)
@@ -376,21 +385,21 @@ class Findings:
             str(row.sequence),
         )
 
-    @cached_property
-    def _kept_runs(self) -> set[tuple[Any, ...]]:
-        """Runs whose facility waveforms are in the store."""
-        return {
-            tuple(key[name] for name in Case.KEYS)
-            for mode in self.modes
-            for key, _ in self.waveforms(mode=mode)
-        }
+    def run(self, case: Case) -> Trajectory | None:
+        """The facility of a case on its POI voltage; None where the store has no voltage of it."""
+        with self._store() as store:
+            voltage = store.voltage(case.hosting, case.period, case.fault, case.site)
+        if voltage is None:
+            return None
+        d = float(self.provenance["periods"][case.period]["dc_factor"])
+        return self.simulator(case.mode).attempt(
+            voltage, H=1.0, beta=case.beta, d=d, pf=self.study.hosting.pf
+        )
 
 
 @dataclass(frozen=True)
 class Case:
     """One checked facility run: where it was and what came out."""
-
-    KEYS = ("hosting", "period", "fault", "site", "mode", "beta")
 
     hosting: str
     period: str

@@ -20,8 +20,7 @@ from dcvrt.studies import plans, simulations, system_limit
 from dcvrt.studies.campaign import Campaign
 from dcvrt.studies.setting import Setting
 from dcvrt.studies.simulations import CANDIDATES, FRONTIER, Job
-from dcvrt.studies.store import Store, records
-from dcvrt.waveform import Waveform
+from dcvrt.studies.store import DETAILS, Store, records
 
 METHOD = "frontier"
 """Method of the plans that the frontier finds."""
@@ -60,6 +59,7 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
     limits = system_limit.wanted(setting)
     asked.roles = system_limit.ROLES
     within = search(limits, "system limits") if limits else []
+    front = system_limit.front(setting, known.replayed) if limits else []
     rows = [_plan_row(setting, one) for one in found]
     limited = [
         system_limit.plan_row(setting, limit, one) for (_, limit), one in zip(limits, within, strict=True)
@@ -74,6 +74,8 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
         store.put("plans", rows)
         store.clear("system_plans")
         store.put("system_plans", limited)
+        store.clear("system_front")
+        store.put("system_front", front)
         store.note(frontier_from=_state(store, setting))
     # All of them were replayed in the search; sensitivities may begin while other methods make their plans.
     found_plans = [plan for plan in records(store.plans()) if plan["method"] == METHOD]
@@ -103,11 +105,9 @@ def run_mechanisms(store: Store, setting: Setting) -> None:
 
 def _mechanism(store: Store, setting: Setting, plan: Mapping[str, Any], item: Mapping[str, Any]) -> str:
     place = {name: item[name] for name in ("period", "fault", "site")}
-    kept = store.waveforms(hosting=plan["hosting"], mode="", **place)
-    if not kept:
+    waveform = store.voltage(plan["hosting"], **place)
+    if waveform is None:
         return "not known: the replay has no waveform"
-    _, signals = kept[0]
-    waveform = Waveform(signals["t_s"].astype(np.float64), signals["v_re_pu"] + 1j * signals["v_im_pu"])
     file, mode, target = setting.file, plan["mode"], item["target"]
     simulator = replay.simulator_of(
         mode, file.facility.parameters | file.facility.parameters_by_mode.get(mode, {})
@@ -192,11 +192,12 @@ class _Campaign:
         self.lost += simulations.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
         return [
             exact_of(
-                [r for r in records(store.margins(hosting=name)) if (r["mode"], r["beta"]) in runs],
+                [row for row in records(replayed) if (row["mode"], row["beta"]) in runs],
                 self.setting.sites,
                 H,
             )
             for name, H, runs in plans
+            for replayed in [store.margins(hosting=name, leave=DETAILS)]
         ]
 
     def _by_site(self, ask: Ask) -> dict[str, float]:

@@ -67,24 +67,10 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     store = campaign.store
     plans = [p for p in records(store.plans()) if p["method"] != NO_VRT]
     limited = records(store.system_plans())
-    wanted: dict[str, tuple[list[float], set[tuple[str, float]]]] = {}
-    for plan in [*plans, *limited]:
-        if plan["total_mw"] > 0:
-            wanted.setdefault(plan["hosting"], (_hosted(plan, setting), set()))[1].add(
-                (plan["mode"], plan["beta"])
-            )
-    replayed = store.margins(hosting=list(wanted), leave=DETAILS)[PLAN]
-    made = {tuple(key) for key in replayed.itertuples(index=False)}
-    lost = replay_plans(
-        campaign,
-        setting,
-        REPLAYS,
-        [
-            (name, H, missing)
-            for name, (H, runs) in wanted.items()
-            if (missing := sorted(run for run in runs if (name, *run) not in made))
-        ],
-    )
+    wanted = {plan["hosting"]: _hosted(plan, setting) for plan in [*plans, *limited] if plan["total_mw"] > 0}
+    made = set(store.margins(hosting=list(wanted), leave=DETAILS).hosting)
+    open_plans = [(name, H, setting.runs) for name, H in wanted.items() if name not in made]
+    lost = replay_plans(campaign, setting, REPLAYS, open_plans)
     write_verdicts(store, setting, plans, limited)
     return lost
 
@@ -167,12 +153,6 @@ def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:
         store.put("margins", [{"hosting": names[task.key], **row} for row in rows])
 
     return campaign.run(phase, tasks, coupling.check_hosting, record, record_lost)
-
-
-# -- fits ----------------------------------------------------------------------------------------------------
-
-
-# -- plans ---------------------------------------------------------------------------------------------------
 
 
 def hosting_row(name: str, role: str, subset: str, by_site: Mapping[int, float]) -> dict[str, Any]:

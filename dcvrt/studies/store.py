@@ -20,10 +20,8 @@ replayed there and no plan; 'system search', 'system candidate': the same for pl
                Where ok = 0 the margins are empty and the row counts as a failure, never as a pass; failed_in
                says what failed: 'grid' (no waveform), 'start' (a facility without an equilibrium before the
                fault), 'facility' (a run that ended early) or 'task' (set aside before it ended).
-`waveforms`    hosting, period, fault, site; mode and beta are '' and 0 for the voltage that the grid gave,
-else those
-               of the facility run; signals (names with units), values: float32, byte-shuffled, zlib. The
-               first signal is always t_s.
+`waveforms`    POI voltages of the replays: hosting, period, fault, site; signals (names with units), values:
+               float32, byte-shuffled, zlib. The first signal is always t_s.
 `surrogates`   one fitted margin: method, mode, site, fault, target ('voltage' or 'loss'), period ('' where
 pooled),
                beta (0 where pooled); intercept (tightened), slopes {bus: per MW}, rating_slope, tightening;
@@ -50,6 +48,9 @@ binding and
                passed, n_failed (faults and periods without a result); aggregate_loss_mw, the largest; losses
                (JSON), one by one: period, fault, loss_mw, limit_mw, whole (buses that are lost whole);
                search as in `plans`.
+`system_front` hosting vectors that were replayed, with what all sites together lose at once in the worst
+               fault: mode, beta, hosting, total_mw, loss_mw; of each mode and rating those of which no other
+               hosts more and loses less.
 `sensitivities` of one plan of each mode: mode, number (most at stake first), path, unit, doc, source, value;
                by_unit: MW per unit by gradients, NULL where no margin holds the plan; sides (JSON, low and
                high: value, linear_mw (to first order), gradient_mw (through the hosting programme), refused,
@@ -77,11 +78,12 @@ import numpy as np
 import numpy.typing as npt
 
 from dcvrt.errors import InputError
+from dcvrt.waveform import Waveform
 
 if TYPE_CHECKING:
     import pandas as pd
 
-VERSION = 5
+VERSION = 6
 """Of the tables below; a store of another version is refused."""
 RUN_FAILED = ("start", "facility")
 """Values of `failed_in` of facility runs that have no result."""
@@ -100,9 +102,8 @@ TABLES = {
     "diagnostics TEXT NOT NULL, gradients TEXT NOT NULL DEFAULT '{}', "
     "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
     "waveforms": "hosting TEXT NOT NULL, period TEXT NOT NULL, fault TEXT NOT NULL, site INTEGER NOT NULL, "
-    "mode TEXT NOT NULL, beta REAL NOT NULL, signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT "
-    "NULL, "
-    "PRIMARY KEY (hosting, period, fault, site, mode, beta)",
+    "signals TEXT NOT NULL, n INTEGER NOT NULL, packed BLOB NOT NULL, "
+    "PRIMARY KEY (hosting, period, fault, site)",
     "surrogates": "method TEXT NOT NULL, mode TEXT NOT NULL, site INTEGER NOT NULL, fault TEXT NOT NULL, "
     "target TEXT NOT NULL, period TEXT NOT NULL, beta REAL NOT NULL, intercept REAL, slopes TEXT NOT NULL, "
     "rating_slope REAL, tightening REAL, unknown TEXT NOT NULL, n_fit INTEGER, n_validation INTEGER, "
@@ -130,6 +131,8 @@ TABLES = {
     "ac_status TEXT, worst TEXT NOT NULL DEFAULT '{}', replayed INTEGER NOT NULL DEFAULT 0, passed INTEGER, "
     "n_failed INTEGER NOT NULL DEFAULT 0, aggregate_loss_mw REAL, losses TEXT NOT NULL DEFAULT '[]', "
     "search TEXT NOT NULL, PRIMARY KEY (mode, beta, limit_mw, limit_share)",
+    "system_front": "mode TEXT NOT NULL, beta REAL NOT NULL, hosting TEXT NOT NULL, total_mw REAL NOT NULL, "
+    "loss_mw REAL NOT NULL, PRIMARY KEY (mode, beta, hosting)",
     "sensitivities": "mode TEXT NOT NULL, number INTEGER NOT NULL, path TEXT NOT NULL, unit TEXT NOT NULL, "
     "doc TEXT NOT NULL, source TEXT NOT NULL, value REAL NOT NULL, by_unit REAL, sides TEXT NOT NULL, "
     "stake_mw REAL NOT NULL, PRIMARY KEY (mode, path)",
@@ -256,31 +259,11 @@ class Store:
         )
 
     def put_waveform(
-        self,
-        signals: Mapping[str, npt.ArrayLike],
-        *,
-        hosting: str,
-        period: str,
-        fault: str,
-        site: int,
-        mode: str = "",
-        beta: float = 0.0,
+        self, signals: Mapping[str, npt.ArrayLike], *, hosting: str, period: str, fault: str, site: int
     ) -> None:
         """Write signals over one time axis, `t_s` first."""
-        self.put(
-            "waveforms",
-            [
-                dict(
-                    hosting=hosting,
-                    period=period,
-                    fault=fault,
-                    site=site,
-                    mode=mode,
-                    beta=beta,
-                    **pack(signals),
-                )
-            ],
-        )
+        row = dict(hosting=hosting, period=period, fault=fault, site=site, **pack(signals))
+        self.put("waveforms", [row])
 
     # -- tasks ---------------------------------------------------------------------------------------------
 
@@ -365,6 +348,10 @@ class Store:
         """Every plan under a system limit."""
         return self._frame("system_plans", order="mode, beta, limit_share, limit_mw")
 
+    def system_front(self) -> pd.DataFrame:
+        """Capacity against the load lost at once, of what was replayed."""
+        return self._frame("system_front", order="mode, beta, loss_mw")
+
     def sensitivities(self) -> pd.DataFrame:
         """Sensitivities of one plan of each mode to the assumptions, those with most at stake first."""
         return self._frame("sensitivities", order="mode, number")
@@ -374,21 +361,29 @@ class Store:
         return self._frame("coupling", order="hosting, mode, beta, period, fault, site")
 
     def waveforms(self, **where: Any) -> list[tuple[dict[str, Any], dict[str, npt.NDArray[np.float32]]]]:
-        """Stored waveforms whose columns have the given values, e.g. `waveforms(site=75, mode='gfl')`.
+        """Stored waveforms whose columns have the given values, e.g. `waveforms(site=75, period="peak")`.
 
         Returns
         -------
         list of (key, signals)
-            `key` has hosting, period, fault, site, mode, beta; `signals` maps name to array, `t_s` first.
+            `key` has hosting, period, fault, site; `signals` maps name to array, `t_s` first.
         """
         condition = " AND ".join(f"{column} = ?" for column in where) or "1"
         rows = self._base.execute(
-            "SELECT hosting, period, fault, site, mode, beta, signals, n, packed FROM waveforms "
-            f"WHERE {condition} ORDER BY hosting, period, fault, site, mode, beta",
+            "SELECT hosting, period, fault, site, signals, n, packed FROM waveforms "
+            f"WHERE {condition} ORDER BY hosting, period, fault, site",
             list(where.values()),
         )
-        keys = ("hosting", "period", "fault", "site", "mode", "beta")
-        return [(dict(zip(keys, row[:6], strict=True)), unpack(row[6], row[7], row[8])) for row in rows]
+        keys = ("hosting", "period", "fault", "site")
+        return [(dict(zip(keys, row[:4], strict=True)), unpack(*row[4:])) for row in rows]
+
+    def voltage(self, hosting: str, period: str, fault: str, site: int) -> Waveform | None:
+        """POI voltage of a replay; None where the fault has no result or was not replayed."""
+        kept = self.waveforms(hosting=hosting, period=period, fault=fault, site=site)
+        if not kept:
+            return None
+        _, signals = kept[0]
+        return Waveform(signals["t_s"].astype(np.float64), signals["v_re_pu"] + 1j * signals["v_im_pu"])
 
     def provenance(self) -> dict[str, Any]:
         """What the study is and what it was made with."""

@@ -3,13 +3,14 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from dcvrt.planning.exact import Run
+from dcvrt.planning.exact import Exact, Run
 from dcvrt.planning.requirement import Requirement, SystemLimit
-from dcvrt.planning.search import Found
+from dcvrt.planning.search import Found, Vector
+from dcvrt.planning.verdict import limit_verdict
 from dcvrt.studies import plans
 from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
@@ -25,6 +26,31 @@ def wanted(setting: Setting) -> list[tuple[Run, Requirement]]:
     limits += [SystemLimit(setting.sites, setting.d, share=share) for share in asked.loss_share]
     runs = [run for run in setting.runs if asked.beta is None or run[1] in asked.beta]
     return [(run, limit) for run in runs for limit in limits]
+
+
+def front(setting: Setting, replayed: Mapping[Run, Mapping[Vector, Sequence[Exact]]]) -> list[dict[str, Any]]:
+    """The rows of `system_front`: what may be hosted at what loss, by the replays of all searches.
+
+    A hosting vector is replayed under all faults for every mode and rating, whichever search asked for it. So
+    each of them has a front from below, also where no limit was searched at its rating. The network allows
+    all of these vectors: they are candidates of searches, and the plan without ride-through.
+    """
+    places = len(setting.periods) * len(setting.file.fault)
+    nothing_lost = SystemLimit(setting.sites, setting.d)
+    rows = []
+    for (mode, beta), by_vector in replayed.items():
+        points = []
+        for H, exact in by_vector.items():
+            told = limit_verdict(exact, nothing_lost, places)
+            if not told["n_failed"]:
+                points.append((told["aggregate_loss_mw"], -sum(H), H))
+        most = 0.0
+        for loss, _, H in sorted(points):
+            if sum(H) > most:
+                most = sum(H)
+                name = plans.plan_name(dict(zip(map(str, setting.sites), H, strict=True)))
+                rows.append(dict(mode=mode, beta=beta, hosting=name, total_mw=most, loss_mw=loss))
+    return rows
 
 
 def plan_row(setting: Setting, limit: Requirement, found: Found) -> dict[str, Any]:
@@ -65,19 +91,20 @@ def system_limits(store: Store) -> dict[str, Any]:
         that may be lost, 0 where the limit does not bind; candidates, refused, gap, settled, by_sequence,
         margins of the search; closed_loop (aggregate_loss_mw and passed once the facilities act on the
         network; None where that was not simulated).
-        `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier of the same modes and
-        ratings, whose sites each meet their own criteria.
+        `front`, by mode, rating and rising loss: mode, beta, hosting, total_mw, loss_mw of every replayed
+        vector of which no other hosts more and loses less, by a search or not.
+        `every_site`: mode, beta, total_mw, passed and aggregate_loss_mw of the frontier, whose sites each
+        meet their own criteria.
     """
     known, coupled = store.provenance(), records(store.coupling())
     rows = [
         _row(plan) | {"closed_loop": in_closed_loop(plan, coupled, known["periods"], known["criteria"])}
         for plan in records(store.system_plans())
     ]
-    runs = dict.fromkeys((row["mode"], row["beta"]) for row in rows)
-    plans = [p for p in records(store.plans()) if p["method"] == "frontier"]
-    every = [p for p in plans if (p["mode"], p["beta"]) in runs]
+    every = [p for p in records(store.plans()) if p["method"] == "frontier" and rows]
     return {
         "rows": rows,
+        "front": records(store.system_front()),
         "every_site": [
             {name: p[name] for name in ("mode", "beta", "total_mw")}
             | {"passed": _passed(p), "aggregate_loss_mw": p["aggregate_loss_mw"]}

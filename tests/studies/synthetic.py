@@ -371,7 +371,7 @@ def _waveforms(store: Store, file: StudyFile, plan: dict[str, Any], rows: list[d
     inside = [row for row in rows if row["h_mw"] > 0]
     if not inside:
         return
-    worst = min(inside, key=lambda row: row["loss_margin_share"])
+    worst = min(inside, key=lambda row: min(row["v_margin_pu"], row["loss_margin_share"]))
     start = file.fault[0].t_start_s
     dip = (t >= start) & (t < start + 0.1)
     for row in rows:
@@ -384,24 +384,3 @@ def _waveforms(store: Store, file: StudyFile, plan: dict[str, Any], rows: list[d
                 fault=row["fault"],
                 site=row["site"],
             )
-    p = np.where(dip, 1.0 - worst["loss_share"], 1.0)
-    store.put_waveform(
-        {
-            "t_s": t,
-            "v_it_pu": 1.0 - 0.05 * dip,
-            "p_g_pu": p,
-            "q_g_pu": 0.2 * p,
-            "i_g_pu": p,
-            "p_b_pu": 1.0 - p,
-            "soc_1": 0.8 + 0 * t,
-            "w_dc_1": 1.0 - 0.1 * dip,
-            "p_out_pu": 1.0 + 0 * t,
-            "mode_1": 1.0 * dip,
-        },
-        hosting=plan["hosting"],
-        period=worst["period"],
-        fault=worst["fault"],
-        site=worst["site"],
-        mode=plan["mode"],
-        beta=plan["beta"],
-    )

@@ -103,8 +103,8 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
 
 def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
     text = changed(
-        ("loss_mw = [0.0, 20.0, 80.0]", "loss_mw = [20.0, 20.0]\nloss_share = [0.2, 0.1]"),
-        ("beta = [1.15] ", "beta = [1.16] "),
+        ("loss_mw = [0.0, 10.0, 20.0, 80.0]", "loss_mw = [20.0, 20.0]\nloss_share = [0.2, 0.1]"),
+        ("beta = [1.1, 1.25] ", "beta = [1.1, 1.16] "),
         ("search = true", "search = false"),
     )
     assert complaint(text) == (
@@ -113,13 +113,13 @@ def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
         "  system_limit.loss_share = [0.2, 0.1]: must rise from one value to the next.\n"
         "  system_limit: its plans are searched after the frontier, and frontier.search = false. Way out: "
         "search = true, or no limits.\n"
-        "  system_limit.beta[1] = 1.16: is not in facility.beta, which has 1, 1.05, 1.1, 1.125, 1.15, 1.175, "
+        "  system_limit.beta[2] = 1.16: is not in facility.beta, which has 1, 1.05, 1.1, 1.125, 1.15, 1.175, "
         "1.2, 1.25, 1.3, 1.35, 1.4, 1.5."
     )
 
 
 def test_values_that_no_system_limit_has_are_told() -> None:
-    text = changed(("loss_mw = [0.0, 20.0, 80.0]", "loss_mw = [-1.0]\nloss_share = [1.5]\nloss_pu = 3"))
+    text = changed(("loss_mw = [0.0, 10.0, 20.0, 80.0]", "loss_mw = [-1.0]\nloss_share = [1.5]\nloss_pu = 3"))
     assert complaint(text) == (
         "my.toml: 3 problems\n"
         "  system_limit.loss_mw[1] = -1.0: must be at least 0.\n"

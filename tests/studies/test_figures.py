@@ -254,21 +254,23 @@ def test_rating_line_is_the_static_loss_law() -> None:
         assert 1.0 - min(1.0, beta * v) == pytest.approx(0.1)
 
 
-def test_worst_case_is_the_least_margin_of_the_kept_runs(folder: Path) -> None:
+def test_worst_case_is_the_least_margin_of_a_plan_and_is_run_again_on_its_voltage(folder: Path) -> None:
     findings = Findings(folder)
     case = findings.worst_case("gfl")
     assert case is not None
-    kept = {
-        (k["hosting"], k["period"], k["fault"], k["site"], k["beta"])
-        for k, _ in findings.waveforms(mode="gfl")
-    }
-    runs = findings.margins[findings.margins["mode"] == "gfl"]
+    plans = set(findings.plans[["hosting", "mode", "beta"]].itertuples(index=False, name=None))
     least = min(
         min(r.v_margin_pu, r.loss_margin_share)
-        for r in runs.itertuples()
-        if (r.hosting, r.period, r.fault, r.site, r.beta) in kept
+        for r in findings.margins.rename(columns={"mode": "variant"}).itertuples()
+        if r.variant == "gfl" and (r.hosting, "gfl", r.beta) in plans and r.h_mw > 0 and r.ok
     )
     assert min(case.v_margin_pu, case.loss_margin_share) == least
+    run = findings.run(case)
+    assert run is not None
+    assert run.completed
+    assert (run.t[0], run.t[-1]) == (0.0, findings.study.grid.t_end_s)
+    d = findings.provenance["periods"][case.period]["dc_factor"]
+    assert run["p_out"][0] == pytest.approx(d, rel=0.05)  # the load of the period, on the base of the site
     with styled():
         figure = worst.draw(findings, case)
     assert f"bus {case.site} (worst)" in texts_of(figure)

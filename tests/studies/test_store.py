@@ -146,7 +146,7 @@ def test_another_version_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         Store(tmp_path / "s")
     assert str(caught.value) == (
-        f"{tmp_path / 's'}: store version 7, this dcvrt reads version 5. "
+        f"{tmp_path / 's'}: store version 7, this dcvrt reads version 6. "
         "Way out: run the study again into a new folder."
     )
 

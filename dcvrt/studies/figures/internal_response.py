@@ -31,12 +31,12 @@ def on_test_waveform(findings: Findings, mode: str) -> tuple[Trajectory | None, 
     run, status
         No run where there is none: the status then says why.
     """
-    from dcvrt.integrators import Simulator
     from dcvrt.waveform import Waveform
 
     try:
-        simulator = Simulator(findings.facility(mode), save_at=2e-3)
-        run = simulator.attempt(Waveform.ercot_style(), beta=rating(findings), pf=findings.study.hosting.pf)
+        run = findings.simulator(mode).attempt(
+            Waveform.ercot_style(), beta=rating(findings), pf=findings.study.hosting.pf
+        )
     except DcvrtError as error:
         return None, str(error)
     return run, str(run.status)

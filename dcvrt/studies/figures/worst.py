@@ -26,6 +26,8 @@ from dcvrt.studies.style import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from dcvrt.trajectory import Trajectory
+
 SITE_LINES = ("-", (0, (5, 1.5)), (0, (3, 1.2, 1, 1.2)), (0, (1, 1)))
 
 
@@ -33,21 +35,11 @@ def draw(findings: Findings, case: Case) -> Figure:
     """POI voltage at every site above; voltages, powers and DC energy of the worst facility below."""
     grid = {
         key["site"]: signals
-        for key, signals in findings.waveforms(
-            hosting=case.hosting, period=case.period, fault=case.fault, mode=""
-        )
+        for key, signals in findings.waveforms(hosting=case.hosting, period=case.period, fault=case.fault)
     }
-    found = findings.waveforms(
-        hosting=case.hosting,
-        period=case.period,
-        fault=case.fault,
-        site=case.site,
-        mode=case.mode,
-        beta=case.beta,
-    )
-    signals = found[0][1] if found else {}
-    figure = new_figure(PAGE, 5.2 if signals else 2.4)
-    panels = figure.subplots(3 if signals else 1, 1, sharex=True, squeeze=False)[:, 0]
+    run = findings.run(case)
+    figure = new_figure(PAGE, 5.2 if run else 2.4)
+    panels = figure.subplots(3 if run else 1, 1, sharex=True, squeeze=False)[:, 0]
     name = letters()
     volts = panels[0]
     for k, site in enumerate(findings.sites):
@@ -63,25 +55,25 @@ def draw(findings: Findings, case: Case) -> Figure:
     volts.set_ylabel("voltage (pu)")
     volts.set_ylim(bottom=0.0)
     panel(volts, next(name), f"POI voltage at each site, fault {case.fault}, period {case.period}")
-    if signals:
-        _facility(findings, case, signals, panels[1:], name)
+    if run:
+        _facility(findings, case, run, panels[1:], name)
     for axes in panels:
         axes.legend(loc="center left", bbox_to_anchor=(1.005, 0.5))
     panels[-1].set_xlabel("time (s)")
-    start, end = _window(findings, case, grid, signals)
+    start, end = _window(findings, case, grid, run)
     panels[-1].set_xlim(start, end)
     figure.align_ylabels()
     return figure
 
 
-def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels: Any, name: Any) -> None:
+def _facility(findings: Findings, case: Case, run: Trajectory, panels: Any, name: Any) -> None:
     from matplotlib.patches import Patch
 
     inside, powers = panels
-    t = signals["t_s"]
+    t = run.t
     modes = findings.facility(case.mode).automaton_behind("mode").modes
-    inside.plot(t, signals["v_it_pu"], color=PALETTE[0], label="protected IT voltage")
-    inside.plot(t, signals["w_dc_1"], color=PALETTE[4], linestyle=(0, (4, 1.5)), label="DC energy / nominal")
+    inside.plot(t, run["v_it"], color=PALETTE[0], label="protected IT voltage")
+    inside.plot(t, run["w_dc"], color=PALETTE[4], linestyle=(0, (4, 1.5)), label="DC energy / nominal")
     inside.axhline(
         findings.study.criteria.v_it_min_pu,
         color=GREY,
@@ -95,17 +87,17 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
         next(name),
         f"{mode_name(case.mode)}, β = {case.beta:g}, at bus {case.site}: voltage and DC energy",
     )
-    powers.plot(t, signals["p_out_pu"], color=PALETTE[2], linestyle=(0, (1, 1.2)), label="facility load")
-    powers.plot(t, signals["p_g_pu"], color=INK, label="import at the POI")
-    powers.plot(t, signals["p_b_pu"], color=PALETTE[1], label="battery")
-    powers.plot(t, signals["q_g_pu"], color=PALETTE[3], linestyle=(0, (4, 1.5)), label="reactive import")
-    floor = (1.0 - findings.study.criteria.loss_share) * float(np.asarray(signals["p_g_pu"])[0])
+    powers.plot(t, run["p_out"], color=PALETTE[2], linestyle=(0, (1, 1.2)), label="facility load")
+    powers.plot(t, run["p_g"], color=INK, label="import at the POI")
+    powers.plot(t, run["p_b"], color=PALETTE[1], label="battery")
+    powers.plot(t, run["q_g"], color=PALETTE[3], linestyle=(0, (4, 1.5)), label="reactive import")
+    floor = (1.0 - findings.study.criteria.loss_share) * float(run["p_g"][0])
     powers.axhline(floor, color=GREY, linewidth=0.9, linestyle=(0, (1, 1.5)), label="least import allowed")
     powers.set_ylabel("power (pu of H)")
     panel(powers, next(name), "powers")
     for axes in panels:
-        shade_modes(axes, np.asarray(t), signals["mode_1"], modes)
-    visited = sorted(set(np.round(np.asarray(signals["mode_1"], dtype=float)).astype(int).tolist()))
+        shade_modes(axes, t, run["mode"], modes)
+    visited = sorted(set(np.round(run["mode"]).astype(int).tolist()))
     handles = [
         Patch(facecolor=mode_band(modes[k], modes), edgecolor=GREY, linewidth=0.6, label=modes[k])
         for k in visited
@@ -120,18 +112,18 @@ def _facility(findings: Findings, case: Case, signals: Mapping[str, Any], panels
 
 
 def _window(
-    findings: Findings, case: Case, grid: Mapping[int, Mapping[str, Any]], signals: Mapping[str, Any]
+    findings: Findings, case: Case, grid: Mapping[int, Mapping[str, Any]], run: Trajectory | None
 ) -> tuple[float, float]:
     """Time from shortly before the fault to when the supervisor has settled, or the end of the record."""
-    ends = [float(s["t_s"][-1]) for s in [*grid.values(), *([signals] if signals else [])]]
+    ends = [float(s["t_s"][-1]) for s in grid.values()]
     end = max(ends, default=1.0)
     fault = next((f for f in findings.faults if fault_label(f.model_dump()) == case.fault), None)
     if fault is None:
         return 0.0, end
     cleared = fault.t_start_s + 1e-3 * fault.t_clear_ms
     settled = cleared + 0.5
-    if signals:
-        moving = np.flatnonzero(np.diff(np.round(np.asarray(signals["mode_1"], dtype=float))))
+    if run:
+        moving = np.flatnonzero(np.diff(np.round(run["mode"])))
         if len(moving):
-            settled = max(settled, float(signals["t_s"][moving[-1] + 1]) + 0.2)
+            settled = max(settled, float(run.t[moving[-1] + 1]) + 0.2)
     return max(0.0, fault.t_start_s - 0.1), min(end, settled)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from dcvrt.studies.comparison import buses
@@ -68,10 +68,11 @@ def system_limit(findings: Findings) -> Safe:
                 picture,
                 alt=f"Hosted capacity against the load lost at once. {' '.join(said)}",
                 caption=(
-                    "Hosted capacity against the load lost at once in the worst fault, by the replay. Each "
-                    "mark is a plan; steps between them, since a larger limit allows it too. Limits in MW "
-                    "and as a share of the load lie on the same curve. Open marks: plans whose every site "
-                    "rides through, at what they lose."
+                    "Hosted capacity against the load lost at once in the worst fault, by the replay, for "
+                    "every mode and rating. Each step is a hosting vector that was replayed, for whichever "
+                    "mode and rating it was searched; what may be hosted within a loss is as much or more. "
+                    "Filled marks: plans searched within a limit. Open marks: plans whose every site rides "
+                    "through, at what they lose."
                 ),
             )
         )
@@ -86,6 +87,7 @@ def system_limit(findings: Findings) -> Safe:
             words=[4, 6],
         )
     )  # fmt: skip
+    parts.append(_at_every_rating(found))
     parts.append(
         paragraph(
             "Gain: hosted MW for each MW more that may be lost, by the prices of the hosting programme; a "
@@ -95,16 +97,45 @@ def system_limit(findings: Findings) -> Safe:
     return section(TITLE, *parts, *_reservations(rows), name=ANCHOR)
 
 
+def within(front: Iterable[Mapping[str, Any]], mw: float) -> float:
+    """The most that was replayed and loses no more than a limit, MW.
+
+    >>> within([{"loss_mw": 8.0, "total_mw": 90.0}, {"loss_mw": 11.0, "total_mw": 120.0}], 10.0)
+    90.0
+    """
+    return max((row["total_mw"] for row in front if row["loss_mw"] <= mw), default=0.0)
+
+
+def _at_every_rating(found: Mapping[str, Any]) -> Safe:
+    """What may at least be hosted within each limit in MW, for every mode and rating."""
+    fronts: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
+    for row in found["front"]:
+        fronts.setdefault((row["mode"], row["beta"]), []).append(row)
+    limits = sorted({row["limit_mw"] for row in found["rows"] if row["limit_mw"] > 0})
+    if not fronts or not limits:
+        return Safe("")
+    return table(
+        "At least hosted within a limit (MW), by what was replayed for whichever mode and rating",
+        ["mode", "β", *(f"{mw:g} MW" for mw in limits)],
+        [
+            [mode_name(mode), f"{beta:g}", *(number(within(front, mw), 1) for mw in limits)]
+            for (mode, beta), front in fronts.items()
+        ],
+    )
+
+
 def _tried(findings: Findings) -> str:
     """Which of the ratings studied the limits were tried at."""
     tried = sorted({row["beta"] for row in findings.system_limits["rows"]})
     studied = findings.study.facility.beta
     said = (
-        f"Tried at {len(tried)} of the {len(studied)} ratings studied: {', '.join(f'{b:g}' for b in tried)}."
+        f"The largest plans were searched at {len(tried)} of the {len(studied)} ratings studied: "
+        f"{', '.join(f'{b:g}' for b in tried)}."
     )
     if len(tried) < len(studied):
         said += (
-            " [system_limit] of the study file takes more ratings and limits; the same folder may be run "
+            " What was replayed for any search is told for all ratings: what may at least be hosted there. "
+            "[system_limit] of the study file takes more ratings and limits; the same folder may be run "
             "again with them."
         )
     return said
