@@ -103,8 +103,8 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
 
 def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
     text = changed(
-        ("loss_mw = [0.0, 10.0, 20.0, 80.0]", "loss_mw = [20.0, 20.0]\nloss_share = [0.2, 0.1]"),
-        ("beta = [1.1, 1.25] ", "beta = [1.1, 1.16] "),
+        ("loss_mw = [0.0, 20.0, 80.0]", "loss_mw = [20.0, 20.0]\nloss_share = [0.2, 0.1]"),
+        ("beta = [1.05, 1.15, 1.2, 1.3] ", "beta = [1.05, 1.16] "),
         ("search = true", "search = false"),
     )
     assert complaint(text) == (
@@ -119,7 +119,7 @@ def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
 
 
 def test_values_that_no_system_limit_has_are_told() -> None:
-    text = changed(("loss_mw = [0.0, 10.0, 20.0, 80.0]", "loss_mw = [-1.0]\nloss_share = [1.5]\nloss_pu = 3"))
+    text = changed(("loss_mw = [0.0, 20.0, 80.0]", "loss_mw = [-1.0]\nloss_share = [1.5]\nloss_pu = 3"))
     assert complaint(text) == (
         "my.toml: 3 problems\n"
         "  system_limit.loss_mw[1] = -1.0: must be at least 0.\n"
