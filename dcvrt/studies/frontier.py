@@ -59,7 +59,6 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
     limits = system_limit.wanted(setting)
     asked.roles = system_limit.ROLES
     within = search(limits, "system limits") if limits else []
-    front = system_limit.front(setting, known.replayed) if limits else []
     rows = [_plan_row(setting, one) for one in found]
     limited = [
         system_limit.plan_row(setting, limit, one) for (_, limit), one in zip(limits, within, strict=True)
@@ -74,8 +73,6 @@ def run_frontier(campaign: Campaign, setting: Setting, progress: Any) -> list[st
         store.put("plans", rows)
         store.clear("system_plans")
         store.put("system_plans", limited)
-        store.clear("system_front")
-        store.put("system_front", front)
         store.note(frontier_from=_state(store, setting))
     # All of them were replayed in the search; sensitivities may begin while other methods make their plans.
     found_plans = [plan for plan in records(store.plans()) if plan["method"] == METHOD]

@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import dcvrt
 from dcvrt.errors import InputError
-from dcvrt.studies import checks, config, coupling, fits, frontier, outputs, plans, sensitivity, simulations
+from dcvrt.studies import (
+    checks,
+    config,
+    coupling,
+    fits,
+    frontier,
+    outputs,
+    plans,
+    sensitivity,
+    simulations,
+    system_limit,
+)
 from dcvrt.studies.campaign import LOST, Campaign, crew_of
 from dcvrt.studies.config import StudyFile
 from dcvrt.studies.progress import Silent
@@ -135,6 +146,7 @@ class Study:
                     surrogates = fits.run_fits(store, setting)
                     plans.run_plans(store, setting, surrogates, reporter)
                     lost += simulations.run_replays(campaign, setting)
+                    system_limit.write_front(store, setting)
                     lost += coupling.run_coupling(campaign, setting)
                     lost += sensitivity.run_sensitivity(campaign, setting, reporter)
                 finally:

@@ -3,20 +3,24 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from dcvrt.planning.exact import Exact, Run
+from dcvrt.planning.exact import Run, exact_of
 from dcvrt.planning.requirement import Requirement, SystemLimit
-from dcvrt.planning.search import Found, Vector
+from dcvrt.planning.search import Found
 from dcvrt.planning.verdict import limit_verdict
 from dcvrt.studies import plans
 from dcvrt.studies.setting import Setting
-from dcvrt.studies.store import Store, records
+from dcvrt.studies.store import DETAILS, Store, records
 
 ROLES = ("system search", "system candidate")
 """Roles of the hosting vectors that are simulated for these plans alone, and of those replayed for them."""
+
+
+REPLAYED = ("plan", "candidate", "system candidate")
+"""Roles of hosting vectors that are replayed, if they host anything."""
 
 
 def wanted(setting: Setting) -> list[tuple[Run, Requirement]]:
@@ -28,28 +32,63 @@ def wanted(setting: Setting) -> list[tuple[Run, Requirement]]:
     return [(run, limit) for run in runs for limit in limits]
 
 
-def front(setting: Setting, replayed: Mapping[Run, Mapping[Vector, Sequence[Exact]]]) -> list[dict[str, Any]]:
-    """The rows of `system_front`: what may be hosted at what loss, by the replays of all searches.
+def write_front(store: Store, setting: Setting) -> None:
+    """Write what may be hosted at what loss, by all replays; nothing where no limit was asked for.
 
-    A hosting vector is replayed under all faults for every mode and rating, whichever search asked for it. So
-    each of them has a front from below, also where no limit was searched at its rating. The network allows
-    all of these vectors: they are candidates of searches, and the plan without ride-through.
+    A hosting vector is replayed under all faults for every mode and rating, whatever search or method asked
+    for it. So each of them has a front from below, also where no limit was searched at its rating. The
+    network allows these vectors: candidates of searches, and plans that AC power flow confirms.
     """
+    rows: list[dict[str, Any]] = []
+    if wanted(setting):
+        refused = {p["hosting"] for p in records(store.plans()) if p["ac_passed"] == 0}
+        hostings = {
+            row["name"]: row["by_site"]
+            for row in records(store.hostings())
+            if row["role"] in REPLAYED and row["name"] not in refused
+        }
+        margins = store.margins(hosting=list(hostings), leave=DETAILS)
+        replayed = {str(name): records(of_vector) for name, of_vector in margins.groupby("hosting")}
+        for run, points in _losses(setting, hostings, replayed).items():
+            rows += front(run, points)
+    with store.transaction():
+        store.clear("system_front")
+        store.put("system_front", rows)
+
+
+Point = tuple[float, float, str]
+"""What is lost at once in the worst fault, MW; what is hosted, MW; the name of the hosting vector."""
+
+
+def _losses(
+    setting: Setting,
+    hostings: Mapping[str, Mapping[str, float]],
+    replayed: Mapping[str, Iterable[Mapping[str, Any]]],
+) -> dict[Run, list[Point]]:
     places = len(setting.periods) * len(setting.file.fault)
-    nothing_lost = SystemLimit(setting.sites, setting.d)
-    rows = []
-    for (mode, beta), by_vector in replayed.items():
-        points = []
-        for H, exact in by_vector.items():
-            told = limit_verdict(exact, nothing_lost, places)
+    limit = SystemLimit(setting.sites, setting.d)
+    points: dict[Run, list[Point]] = {}
+    for name, rows in replayed.items():
+        H = [hostings[name][str(bus)] for bus in setting.sites]
+        for run, exact in exact_of(rows, setting.sites, H).items():
+            told = limit_verdict(exact, limit, places)
             if not told["n_failed"]:
-                points.append((told["aggregate_loss_mw"], -sum(H), H))
-        most = 0.0
-        for loss, _, H in sorted(points):
-            if sum(H) > most:
-                most = sum(H)
-                name = plans.plan_name(dict(zip(map(str, setting.sites), H, strict=True)))
-                rows.append(dict(mode=mode, beta=beta, hosting=name, total_mw=most, loss_mw=loss))
+                points.setdefault(run, []).append((told["aggregate_loss_mw"], sum(H), name))
+    return points
+
+
+def front(run: Run, points: Iterable[Point]) -> list[dict[str, Any]]:
+    """Rows of `system_front`: the points of a mode and rating that no other dominates.
+
+    >>> points = [(9.0, 50.0, "b"), (8.0, 40.0, "a"), (9.0, 45.0, "c"), (9.5, 50.0, "d")]
+    >>> [row["hosting"] for row in front(("gfl", 1.2), points)]
+    ['a', 'b']
+    """
+    rows: list[dict[str, Any]] = []
+    mode, beta = run
+    for loss, total, name in sorted(points, key=lambda point: (point[0], -point[1], point[2])):
+        if not rows or total > rows[-1]["total_mw"]:
+            rows.append(dict(mode=mode, beta=beta, hosting=name, total_mw=total, loss_mw=loss))
     return rows
 
 

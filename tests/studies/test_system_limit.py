@@ -24,7 +24,7 @@ from dcvrt.studies.setting import Setting
 from dcvrt.studies.store import Store, records
 from dcvrt.studies.study import Result
 from dcvrt.studies.style import styled
-from dcvrt.studies.system_limit import in_closed_loop
+from dcvrt.studies.system_limit import in_closed_loop, write_front
 from tests.planning.test_requirement import SITES as BUSES
 from tests.planning.test_requirement import D, exact
 from tests.studies.stand_in import WORSE, run, setting, stand_in
@@ -83,7 +83,8 @@ def test_capacity_rises_with_the_limit_up_to_what_the_network_takes(tmp_path: Pa
 def test_every_mode_and_rating_has_a_front_of_what_was_replayed(tmp_path: Path, asked: list) -> None:
     study = setting()
     plans = run(tmp_path, study)
-    with Store(tmp_path / "study.sqlite") as store:
+    with Store(tmp_path / "study.sqlite", write=True) as store:
+        write_front(store, study)
         front, hostings = records(store.system_front()), records(store.hostings())
     by_name = {row["name"]: row["by_site"] for row in hostings}
     places = [(period, fault) for period in PERIODS for fault in study.file.fault]
