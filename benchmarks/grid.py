@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,17 @@ STEP = 1 / 120
 UNTIL = 5.0
 SAME_RULE_UNTIL = 1.0
 """End of the runs in which our equations are stepped as ANDES's are, s."""
+ADDED_BY_ANDES = 1e-8
+"""To the resistance and the reactance of every line, pu."""
+ANDES_STATES = {
+    "machine.delta": ("GENROU", "delta"), "machine.omega": ("GENROU", "omega"),
+    "machine.e_q1": ("GENROU", "e1q"), "machine.e_d1": ("GENROU", "e1d"),
+    "machine.e_d2": ("GENROU", "e2d"), "machine.e_q2": ("GENROU", "e2q"),
+    "exciter.x": ("SEXS", "LL_x"), "exciter.e_f": ("SEXS", "LAW_y"),
+    "governor.g": ("TGOV1", "LAG_y"), "governor.x": ("TGOV1", "LL_x"),
+}  # fmt: skip
+"""Model and variable of ANDES of our states in the IEEE 118-bus case."""
+
 SITES = (21, 75, 106, 108)
 HOSTING = {21: 31.4, 75: 153.9, 106: 102.4, 108: 104.1}
 RATING = 1.3
@@ -86,6 +98,7 @@ def _accuracy(grid: Grid, buses: tuple[int, ...], until: float) -> list[Result]:
     return [
         result("ieee118", "power flow", float(np.abs(point.v0 - andes_point.v0).max()), "pu", "ANDES"),
         result("ieee118", "largest residual at rest", point.residual, "pu"),
+        *_initial_states(grid),
         result(case, "|V| in the fault", worst[0], "pu", andes_),
         result(case, "|V| after the fault", worst[1], "pu", andes_),
         *_by_the_same_rule(grid, faults, min(until, SAME_RULE_UNTIL)),
@@ -93,6 +106,28 @@ def _accuracy(grid: Grid, buses: tuple[int, ...], until: float) -> list[Result]:
         result(case, "V", float(np.abs(found.v - reference.v).max()), "pu", "own at 1e-9"),
         result(case, "dV/dH", _sensitivity_error(grid, faults[0], until), "relative", "central differences"),
     ]  # fmt: skip
+
+
+def _initial_states(grid: Grid) -> list[Result]:
+    """States of all machines, exciters and governors before the fault, pu and rad; once more with lines as
+    ANDES has them, which adds 1e-8 pu to every resistance and reactance."""
+    lines, alike = grid.network.branches, replace(grid)
+    longer = replace(lines, r=lines.r + ADDED_BY_ANDES, x=lines.x + ADDED_BY_ANDES)
+    alike.__dict__["network"] = replace(grid.network, branches=longer)  # in place of that of the case
+    system = grid.operating_point(HOSTING, Period()).system
+    found = []
+    for ours, what in ((grid, "initial states"), (alike, "initial states, lines as in ANDES")):
+        worst = 0.0
+        for rest in ours.native.point(HOSTING, Period()).rest:
+            for unit, states in zip(rest.group.units, rest.x, strict=True):
+                for path, state in zip(rest.group.structure.dae.x_names, states, strict=True):
+                    model, variable = ANDES_STATES[path]
+                    prefix = "machine" if model == "GENROU" else model
+                    place = list(system.models[model].idx.v).index(f"{prefix} {unit.bus}")
+                    theirs = getattr(system.models[model], variable).v[place]
+                    worst = max(worst, abs(float(state - theirs)))
+        found.append(result("ieee118", what, worst, "pu", "ANDES"))
+    return found
 
 
 def _by_the_same_rule(grid: Grid, faults: Sequence[BusFault], until: float) -> list[Result]:
