@@ -106,17 +106,17 @@ def test_a_bad_study_file_is_one_message_and_code_2(
 def test_an_infeasible_base_case_is_code_3_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = study(tmp_path, ("rating_scale = 0.6", "rating_scale = 0.2"))
+    file = study(tmp_path, ("rating_scale = 0.6", "rating_scale = 0.38"))
     assert run("study", "run", str(file), "--out", str(tmp_path / "out"), "--workers", "1") == 3
     assert capsys.readouterr().err.splitlines()[1:] == [
-        "ieee118: the base case has no dispatch in at least 6842 of 8760 hours (hours 0, 1, 6, 7, 8, ...) "
-        "with "
+        "ieee118: the base case has no dispatch in 53 of 8760 hours (hours 7768-7770, 8104-8106, 8265-8266, "
+        "8272-8275, 8296-8298, 8321-8322, 8417-8418, 8432-8443, 8456-8461, 8464-8467 and 12 more) with "
         "nothing hosted.",
-        "  Worst hour 8466: branches are overloaded by 30.07 MW whatever the dispatch: 77-78 (rated 30.2 "
+        "  Worst hour 8441: branches are overloaded by 4.667 MW whatever the dispatch: 77-78 (rated 57.38 "
         "MVA), "
-        "77-80 (rated 28.2 MVA).",
-        "Ways out: a larger rating_scale (now 0.2), or more generation behind these branches, or leave these "
-        "hours out.",
+        "77-80 (rated 53.58 MVA).",
+        "Ways out: a larger rating_scale (now 0.38), or more generation behind these branches, or leave "
+        "these hours out.",
     ]
     assert not (tmp_path / "out").exists()
 

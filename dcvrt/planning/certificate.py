@@ -151,6 +151,14 @@ class Hours:
         """Dispatch the hour at position `hour`."""
         return self.dispatcher.solve(self.injection(H, hour), *self.unit_limits(hour))
 
+    def all_hours(self) -> Hours:
+        """The same with every hour a corner."""
+        return Hours(self.network, self.sites, self.year, False, self.outages.rule)
+
+    def served_like(self, found: Dispatched, hour: int, at: Integers) -> Flags:
+        """Which corner hours the dispatch of the hour at a position serves, too, with nothing hosted."""
+        return self._serves(self._remember(found.units, hour), np.zeros(len(self.sites)), at)
+
     def certify(self, H: Floats) -> FlowCut | None:
         """Show that every hour has a dispatch at `H`, or return a cut that `H` violates."""
         todo = np.arange(len(self.corners))

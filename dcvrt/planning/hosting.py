@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dcvrt.errors import InfeasibleError, InputError, SimulationError, did_you_mean, raise_all
+from dcvrt.errors import InfeasibleError, InputError, SimulationError, raise_all
 from dcvrt.grid.network import Network
 from dcvrt.planning import monolith, report
 from dcvrt.planning.agreement import Agreement
@@ -18,15 +19,17 @@ from dcvrt.planning.arguments import (
     argument_faults,
     hosting_faults,
     per_site,
-    row_faults,
     unit_faults,
 )
+from dcvrt.planning.base_case import base_case
 from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import FlowCut
-from dcvrt.planning.master import Cut, Master, Question, Solution
+from dcvrt.planning.master import Cut, Master, Solution
 from dcvrt.planning.objective import MaxMin, MaxTotal, Objective, Rating
 from dcvrt.planning.plan import SETTLED, AcVerdict, Certificate, Plan, Row, VoltageInfo
 from dcvrt.planning.profiles import Year
+from dcvrt.planning.question import Question, ask
+from dcvrt.planning.reasons import refuse_sizes, why_none
 from dcvrt.planning.security import N1
 from dcvrt.planning.voltage_screen import HostedFlow, Tangent, VoltageScreen
 
@@ -136,6 +139,7 @@ class HostingProblem:
         self._base_violations, self._hull = base_violations, hull
         self._flow_cuts: list[FlowCut] = []
         self._voltage_keys: dict[tuple[int, int, int], None] = {}
+        self._largest: dict[int, float] = {}
 
     # -- the pieces, built when first needed ---------------------------------------------------------------
 
@@ -144,7 +148,7 @@ class HostingProblem:
         """The hours as dispatch problems; raises `InfeasibleError` when the base case has no dispatch."""
         hours = Hours(self.network, self.network.indices(self.sites), self.year, self._hull, self.security)
         if hours.certify(np.zeros(len(self.sites))) is not None:
-            raise InfeasibleError(report.base_case(hours, self.rating_scale))
+            raise InfeasibleError(base_case(hours, self.rating_scale))
         return hours
 
     @cached_property
@@ -202,13 +206,35 @@ class HostingProblem:
         InputError
             When something names no site or is not finite.
         InfeasibleError
-            When the base case breaks a limit, rows that belong to no site exclude every plan, or the smallest
-            sizes of sites that must be open exceed the limits.
+            When the base case breaks a limit, rows that belong to no site exclude every plan, the smallest
+            sizes of sites that must be open exceed the limits, or those of all sites do.
         SimulationError
             When voltages do not settle, which happens close to the limit of power transfer.
         """
-        question = self._question(rows, bounds or {}, objective, rating, must_open)
-        return self._answer(question, thorough)
+        question = ask(self.sites, self.lower, self.upper, rows, bounds or {}, objective, rating, must_open)
+        plan = self._answer(question, thorough)
+        if plan.total_mw == 0 and not (question.rows or bounds):
+            refuse_sizes(self, question)
+        return plan
+
+    def largest(self, bus: int) -> float:
+        """Largest size of a site that the network allows, whatever the other sites then host, MW.
+
+        Asked of a copy, so that the linearisations of this problem stay where they are; kept. Where voltages
+        do not settle on the way, nothing is known to be smaller than its `h_max`.
+        """
+        if bus not in self._largest:
+            aside = copy(self)
+            aside.__dict__.pop("screen", None)
+            aside._flow_cuts, aside._voltage_keys = list(self._flow_cuts), {}
+            free, none = np.zeros(len(self.sites)), np.zeros(len(self.sites), dtype=bool)
+            only = MaxTotal({other: float(other == bus) for other in self.sites})
+            question = Question(self.sites, free, self.upper, (), only, None, none)
+            try:
+                self._largest[bus] = aside.optimum(question).by_site[bus]
+            except SimulationError:
+                self._largest[bus] = float(self.upper[self.sites.index(bus)])
+        return self._largest[bus]
 
     def allows(self, hosting: Mapping[int, float]) -> bool:
         """Whether these capacities are sizes that sites may have, and every hour has a dispatch and AC
@@ -253,59 +279,43 @@ class HostingProblem:
         Parameters
         ----------
         points : int
-            Number of plans, at least 2.
+            Least sizes that are asked for, at least 2, from that of the largest total to the largest.
         rows, bounds : as in `solve`.
         shares : as in `MaxMin`.
 
         Returns
         -------
         list of Plan
-            Least sizes rise and totals fall from plan to plan.
+            Least sizes rise and totals fall from plan to plan. Fewer than `points` where several least sizes
+            have one plan: one alone where the largest total has the largest least size.
         """
         if points < 2:
             raise InputError(f"pareto: {points} points; a front has at least 2.")
         rows, fair = tuple(rows), MaxMin(shares or {})
-        question = self._question(rows, bounds or {}, fair, None, ())
+        question = ask(self.sites, self.lower, self.upper, rows, bounds or {}, fair, None, ())
         last = self._answer(question)
-        first = self._answer(replace(question, objective=MaxTotal()))
-        share = question.shares
-        size = np.array([first.by_site[bus] for bus in self.sites])
-        start = float((size[share > 0] / share[share > 0]).min(initial=np.inf))
-        between = np.linspace(start, last.objective, points)[1:-1]
-        return [first, *(self._answer(question.with_floor(mu)) for mu in between), last]
+        front = [self._answer(replace(question, objective=MaxTotal()))]
+        counts = question.shares > 0
 
-    def _question(
-        self,
-        rows: Iterable[Row],
-        bounds: Mapping[int, tuple[float, float]],
-        objective: Objective | None,
-        rating: Rating | None,
-        must_open: Sequence[int],
-    ) -> Question:
-        """Check what is asked."""
-        rows = tuple(rows)
-        objective = MaxTotal() if objective is None else objective
-        lower, upper = self._box(bounds)
-        raise_all(row_faults(rows, self.sites, rating), "requirement rows")
-        problems = objective.faults(self.sites) + ([] if rating is None else rating.faults())
-        problems += [
-            f"must_open names {bus!r}, which is not a site.{did_you_mean(bus, self.sites)}"
-            for bus in must_open
-            if bus not in self.sites
-        ]
-        raise_all(problems, "objective")
-        forced = np.array([bus in set(must_open) for bus in self.sites])
-        return Question(self.sites, lower, upper, rows, objective, rating, forced)
+        def least(plan: Plan) -> float:
+            size = np.array([plan.by_site[bus] for bus in self.sites])
+            return float((size[counts] / question.shares[counts]).min(initial=np.inf))
+
+        for mu in np.linspace(least(front[0]), last.objective, points)[1:-1]:
+            if mu > least(front[-1]):
+                front.append(self._answer(question.with_floor(mu)))
+        return [*front, last] if last.objective > least(front[-1]) + SETTLED else front
 
     def _answer(self, question: Question, thorough: bool = True) -> Plan:
         """Solve; for `MaxMin` the total is maximised once the least size is known."""
-        found = self._optimum(question, thorough)
+        found = self.optimum(question, thorough)
         if not isinstance(question.objective, MaxMin):
             return found
-        kept = self._optimum(question.with_floor(found.objective), thorough)
+        kept = self.optimum(question.with_floor(found.objective), thorough)
         return replace(kept, objective=found.objective)
 
-    def _optimum(self, question: Question, thorough: bool = True) -> Plan:
+    def optimum(self, question: Question, thorough: bool = True) -> Plan:
+        """The best plan for a checked question; raises `InfeasibleError` when there is none."""
         master = question.master()
         _, screen = self.certifier, self.screen  # both refuse a base case that breaks a limit, in this order
         master.cuts = [self._as_cut(cut) for cut in self._flow_cuts]
@@ -334,7 +344,7 @@ class HostingProblem:
                 break
             best = wider
         if best is None:
-            raise InfeasibleError(self._why_none(question, master))
+            raise InfeasibleError(why_none(self, question, master))
         solution, certificate, voltage = best
         return report.plan(self, master, solution, certificate, voltage, gap)
 
@@ -378,25 +388,6 @@ class HostingProblem:
             master.forbid(chosen.open)
         master.cuts = kept
         return None
-
-    def _why_none(self, question: Question, master: Master) -> str:
-        """Say why no plan exists: smallest sizes, or the requirement rows."""
-        forced = question.must_open & (question.lower > 0)
-        if forced.any():
-            sizes = {
-                bus: float(mw) for bus, mw, f in zip(self.sites, question.lower, forced, strict=True) if f
-            }
-            free = replace(
-                question,
-                lower=np.where(forced, 0.0, question.lower),
-                objective=MaxMin({bus: sizes.get(bus, 0.0) for bus in self.sites}),
-            )
-            try:
-                share = self._optimum(free).objective
-            except InfeasibleError:
-                return report.no_plan(master)
-            return report.sizes_too_large(sizes, share)
-        return report.no_plan(master)
 
     def _settle(
         self, master: Master, is_open: Flags, floor: float, agreement: Agreement | None
@@ -443,29 +434,6 @@ class HostingProblem:
         """A flow cut in the hour in which it is tightest."""
         return Cut(-cut.pi[self.certifier.sites], float(self.certifier.bound(cut).min()), cut)
 
-    def _box(self, bounds: Mapping[int, tuple[float, float]]) -> tuple[Floats, Floats]:
-        lower, upper, problems = self.lower.copy(), self.upper.copy(), []
-        for bus, (low, high) in bounds.items():
-            if bus not in self.sites:
-                problems.append(f"{bus!r} is not a site.{did_you_mean(bus, self.sites)}")
-            elif not 0 <= low <= high < np.inf:
-                problems.append(
-                    f"the range of site {bus} is {low:g} to {high:g} MW; "
-                    "it must be ascending and not negative."
-                )
-            else:
-                i = self.sites.index(bus)
-                lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
-                if low == 0.0 and high < self.lower[i]:
-                    lower[i] = upper[i] = 0.0
-                if lower[i] > upper[i]:
-                    problems.append(
-                        f"the range of site {bus}, {low:g} to {high:g} MW, has nothing in common with "
-                        f"its sizes {self.lower[i]:g} to {self.upper[i]:g} MW."
-                    )
-        raise_all(problems, "bounds")
-        return lower, upper
-
     # -- checking ------------------------------------------------------------------------------------------
 
     def dispatch(self, plan: Plan, hour: int) -> Floats:
@@ -510,7 +478,7 @@ class HostingProblem:
         around : Plan, optional
             Point at which the voltage rows are linearised; default nothing hosted.
         """
-        question = self._question(rows, bounds or {}, objective, rating, must_open)
+        question = ask(self.sites, self.lower, self.upper, rows, bounds or {}, objective, rating, must_open)
         at = np.arange(len(self.year)) if hours is None else self.year.positions(hours)
         point = np.zeros(len(self.sites)) if around is None else self._vector(around)
         monolith.build(self, at, question.master(), point).write(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -468,40 +468,3 @@ def _run(
         dual,
         np.array(solution.col_dual),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Question:
-    """What is asked of a hosting problem, checked; see `HostingProblem.solve`."""
-
-    sites: tuple[int, ...]
-    lower: Floats
-    upper: Floats
-    rows: tuple[Row, ...]
-    objective: Objective
-    rating: Rating | None
-    must_open: Flags
-
-    @property
-    def shares(self) -> Floats:
-        """Share of each site in the least size; 0 where it does not count."""
-        return np.where(self.upper > 0, self.objective.vector(self.sites), 0.0)
-
-    def with_floor(self, least: float) -> Question:
-        """The largest total at which no site is smaller than its share of a least size, MW.
-
-        The floor is lower by a part in 1e8, so that rounding does not exclude the plan it was found at.
-        """
-        floor = self.shares * max(least, 0.0) * (1 - 1e-8)
-        return replace(
-            self,
-            lower=np.maximum(self.lower, floor),
-            objective=MaxTotal(),
-            must_open=self.must_open | (floor > 0),
-        )
-
-    def master(self) -> Master:
-        """The master programme without cuts."""
-        return Master(
-            self.sites, self.lower, self.upper, self.rows, self.objective, self.rating, self.must_open
-        )

@@ -323,3 +323,21 @@ def ieee118(wind_mw: Mapping[int, float] | None = None) -> Year:
             "dc": "illustrative: own daily and weekly curve with maximum 1",
         },
     )
+
+
+RANGES = 10
+"""Runs of hours that a message lists."""
+
+
+def in_ranges(hours: npt.ArrayLike) -> str:
+    """Ascending hours in words, runs of them as their ends.
+
+    >>> in_ranges([3, 4, 5, 9])
+    '3-5, 9'
+    >>> in_ranges(range(0, 26, 2))
+    '0, 2, 4, 6, 8, 10, 12, 14, 16, 18 and 3 more'
+    """
+    runs = np.split(at := np.asarray(hours, dtype=np.int64), np.flatnonzero(np.diff(at) > 1) + 1)
+    listed = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:RANGES])
+    left = sum(map(len, runs[RANGES:]))
+    return f"{listed} and {left} more" if left else listed

@@ -1,17 +1,19 @@
-"""What is told about a hosting problem: the plan with its prices, and why there is none."""
+"""What is told about a hosting problem: the plan with its prices, and what AC power flow says of it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from dcvrt.planning.agreement import NEAR
-from dcvrt.planning.certificate import Hours
 from dcvrt.planning.hour import INTACT, FlowCut
 from dcvrt.planning.master import Master, Solution
 from dcvrt.planning.plan import AcVerdict, Binding, Certificate, Plan, VoltageInfo
+from dcvrt.planning.reasons import why_closed
 from dcvrt.planning.security import SecurityInfo
 from dcvrt.planning.voltage_screen import Tangent
 
@@ -25,8 +27,6 @@ NO_PRICE = 1e-7
 CLOSED_MW = 1e-7
 AC_TOLERANCE = 1e-6
 """Violation of a voltage limit that the AC check lets pass, pu."""
-PROGRAMMES = 300
-"""Dispatch programmes spent on finding which hours of an infeasible base case are short."""
 
 
 def plan(
@@ -43,11 +43,16 @@ def plan(
     S = np.where(H > 0, solution.S, 0.0) if len(solution.S) else solution.S
     rating = dict(zip(problem.sites, S.tolist(), strict=False))
     binding = _binding(problem, master, solution)
+    closed = {
+        bus: why_closed(problem, master, site, by_site, rating, _in_the_way(problem, master, solution, site))
+        for site, bus in enumerate(problem.sites)
+        if by_site[bus] == 0
+    }
     return Plan(
         float(H.sum()),
         by_site,
         binding,
-        _closed(master, by_site, rating, binding),
+        closed,
         certificate,
         gap,
         voltage,
@@ -173,44 +178,22 @@ def _flow_bindings(problem: HostingProblem, cut: FlowCut, price: float) -> list[
     return found
 
 
-def _closed(
-    master: Master, by_site: dict[int, float], rating: dict[int, float], binding: tuple[Binding, ...]
-) -> dict[int, str]:
-    """Sites without a facility, each with the requirement that opening it would break, if any."""
-    reasons = {}
-    for i, bus in enumerate(master.sites):
-        if by_site[bus] > 0:
-            continue
-        opened = {**by_site, bus: float(master.lower[i])}
-        own = [(row.value(opened, rating), row) for row in master.rows if row.site == bus]
-        broken = sorted(((room, row) for room, row in own if room < 0), key=lambda found: found[0])
-        if broken:
-            others = len(broken) - 1
-            more = f", and {others} more margin{'s' * (others > 1)} fall{'s' * (others == 1)} short"
-            room, worst = broken[0]
-            short = (
-                f": {-room:.4g} {worst.unit}".rstrip()
-                + f" short at {opened[bus]:g} MW beside the other sites"
-            )
-            said = short if any([*worst.coefficients.values(), *worst.rating.values()]) else ""
-            reasons[bus] = f"{worst.label}{said}{more if others else ''}"
-        elif master.upper[i] == 0:
-            reasons[bus] = "its largest size is 0 MW"
-        elif (alone := _alone(master, i)) < master.lower[i]:
-            reasons[bus] = (
-                f"its smallest size is {master.lower[i]:g} MW, but the limits leave it at most "
-                f"{alone:.4g} MW even alone"
-            )
-        else:
-            limits = ", ".join(f"{b.kind} {b.label}" for b in binding[:3]) or "the other sites"
-            reasons[bus] = f"hosting here gains nothing within the shared limits ({limits})"
-    return reasons
-
-
-def _alone(master: Master, i: int) -> float:
-    """Largest size that the cuts leave a site when no other is open, MW: no less than it can host."""
-    bounds = [cut.b / cut.a[i] for cut in master.cuts if cut.a[i] > 0]
-    return float(min([*bounds, master.upper[i]]))
+def _in_the_way(problem: HostingProblem, master: Master, solution: Solution, site: int) -> Sequence[Binding]:
+    """Limits with a price that hosting at a site would lean on, those first that a MW there costs most."""
+    cost = np.array([max(cut.a[site], 0.0) for cut in solution.cuts])
+    per_mw = replace(
+        solution,
+        S=np.zeros(0),
+        cut_price=solution.cut_price * cost,
+        row_dual=np.where(
+            solution.row_dual * master.coefficients[:, site] > 0,
+            solution.row_dual * abs(master.coefficients[:, site]),
+            0.0,
+        ),
+        bound_price=np.zeros(master.count),
+        floor_price=np.zeros(master.count),
+    )
+    return _binding(problem, master, per_mw)
 
 
 def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
@@ -262,89 +245,4 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         status,
         reactive,
         unhosted,
-    )
-
-
-def base_case(hours: Hours, rating_scale: float) -> str:
-    """Say which hours have no dispatch with nothing hosted, where, and by how much."""
-    network, year = hours.network, hours.year
-    demand = -hours.fixed.sum(axis=0)
-    nothing = np.zeros(len(hours.sites))
-    todo = np.argsort(-demand, kind="stable")
-    short: dict[int, float] = {}
-    worst: tuple[float, int, FlowCut] | None = None
-    spent = 0
-    while len(todo) and spent < PROGRAMMES:
-        at = int(todo[0])
-        found = hours.dispatch(nothing, at)
-        spent += 1
-        if found.cut is not None and found.shortfall > hours.tolerance:
-            if worst is None or found.shortfall > worst[0]:
-                worst = found.shortfall, at, found.cut
-            least = hours.shortfall(found.cut, todo)
-            lost = least > hours.tolerance
-            lost[0] = True
-            short.update({int(t): float(mw) for t, mw in zip(todo[lost], least[lost], strict=True)})
-            todo = todo[~lost]
-        else:
-            todo = todo[1:]
-    assert worst is not None
-    amount, at, cut = worst
-    count = f"{'at least ' if len(todo) else ''}{len(short)} of {len(year)} hours"
-    first = ", ".join(str(h) for h in sorted(int(year.hours[t]) for t in short)[:5]) + (
-        ", ..." if len(short) > 5 else ""
-    )
-    lines = network.branches
-    if cut.lines:
-        where = ", ".join(
-            f"{lines.label(line.branch)} (rated {hours.limit(line):.4g} MVA"
-            + (")" if line.outage == INTACT else f" after the outage of {lines.label(line.outage)})")
-            for line in sorted(cut.lines, key=lambda line: -line.weight)[:4]
-        )
-        cause = f"branches are overloaded by {amount:.4g} MW whatever the dispatch: {where}"
-        way = f"a larger rating_scale (now {rating_scale:g}), or more generation behind these branches"
-    else:
-        low, high = hours.unit_limits(at)
-        cause = (
-            f"units that give {low.sum():.5g} to {high.sum():.5g} MW cannot meet a net load "
-            f"of {demand[at]:.5g} MW ({amount:.4g} MW off)"
-        )
-        way = "more units, or other limits of theirs"
-    return (
-        f"{network.name}: the base case has no dispatch in {count} (hours {first}) with nothing hosted.\n"
-        f"  Worst hour {int(year.hours[at])}: {cause}.\nWays out: {way}, or leave these hours out."
-    )
-
-
-def no_plan(master: Master) -> str:
-    """Say which of the rows that hold for every plan exclude every one, and by how much."""
-    general = [row for row, holds in zip(master.rows, master.always, strict=True) if holds]
-    forced = [bus for bus, must in zip(master.sites, master.must_open, strict=True) if must]
-    missed = master.least_violations()
-    if missed is None or not (missed > NO_PRICE).any():
-        listed = ", ".join(row.label for row in general[:6]) + (", ..." if len(general) > 6 else "")
-        named = f"Rows that hold for every plan: {listed or 'none'}."
-    else:
-        worst = np.argsort(-missed)
-        parts = [
-            f"{master.rows[r].label} ({missed[r]:.4g} {master.rows[r].unit}".rstrip() + " short at least)"
-            for r in worst[:6].tolist()
-            if missed[r] > NO_PRICE
-        ]
-        named = f"Missed: {', '.join(parts)}."
-    others = "every other site" if forced else "every site"
-    return (
-        f"No capacities meet all requirement rows, not even with {others} closed. {named} "
-        "Ways out: give a row the site that it belongs to, so that the site can be closed, "
-        + (f"let site {', '.join(map(str, forced))} be closed, " if forced else "")
-        + "or relax its limit."
-    )
-
-
-def sizes_too_large(sizes: dict[int, float], share: float) -> str:
-    """Say that sites which must be open cannot all have their smallest size."""
-    listed = ", ".join(f"{mw:g} MW at {bus}" for bus, mw in sizes.items())
-    return (
-        f"The smallest sizes of the sites that must be open exceed the limits: {listed}. At most "
-        f"{100 * share:.1f} % of them fit together. Ways out: smaller sizes, or let a site close."
     )

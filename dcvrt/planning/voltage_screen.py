@@ -15,7 +15,7 @@ from dcvrt.grid.powerflow import HourlySolution, PowerFlow
 from dcvrt.grid.schedule import hosting_directions, injections
 from dcvrt.planning import reactive
 from dcvrt.planning.interpolation import VoltageDrop
-from dcvrt.planning.profiles import Year
+from dcvrt.planning.profiles import Year, in_ranges
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -196,12 +196,14 @@ class VoltageScreen:
         """Raise when the base case violates the limits at moving buses or at set points."""
         network, (low, high) = self.network, self.limits
         lines = []
-        for i in np.flatnonzero(outside.any(axis=1)):
+        beyond = np.maximum(low - size, size - high).max(axis=1)
+        for i in np.argsort(-beyond, kind="stable")[: int(outside.any(axis=1).sum())]:
             hours = np.flatnonzero(outside[i])
             k = hours[np.maximum(low - size[i, hours], size[i, hours] - high).argmax()]
             lines.append(
-                f"bus {network.bus[self.moving[i]]}: outside in {len(hours)} hours, "
-                f"worst {size[i, k]:.4f} pu in hour {self.year.hours[k]}"
+                f"bus {network.bus[self.moving[i]]}: outside in {len(hours)} hours "
+                f"({in_ranges(self.year.hours[hours])}), worst {size[i, k]:.4f} pu in hour "
+                f"{self.year.hours[k]}"
             )
         held = np.setdiff1d(np.arange(len(network.bus)), self.moving)
         for i in np.intersect1d(held, np.flatnonzero((network.v_set < low) | (network.v_set > high))):
@@ -211,7 +213,7 @@ class VoltageScreen:
         shown = "\n  ".join(lines[:10]) + (f"\n  ... and {len(lines) - 10} more" if len(lines) > 10 else "")
         raise InfeasibleError(
             f"{network.name}: with nothing hosted {len(lines)} bus(es) are outside the voltage limits "
-            f"{low:g}-{high:g} pu.\n  {shown}\nWays out: wider limits (voltage=...), other set points, or "
+            f"{low:g}-{high:g} pu.\n  {shown}\nWays out: wider voltage limits, other set points, or "
             "base_violations='hold', with which "
             "these voltages must only not get worse."
         )
@@ -308,12 +310,12 @@ class VoltageScreen:
 def _no_base(network: Network, solved: HourlySolution) -> str:
     """Say which hours have no power flow with nothing hosted."""
     failed = np.flatnonzero(~solved.converged)
-    named = ", ".join(str(hour) for hour in solved.hours[failed[:5]]) + (", ..." if len(failed) > 5 else "")
     buses, count = np.unique(solved.worst_bus[failed], return_counts=True)
     worst = ", ".join(str(bus) for bus in buses[np.argsort(-count, kind="stable")[:3]])
     return (
         f"{network.name}: with nothing hosted {len(failed)} of {len(solved.hours)} hours have no AC power "
-        f"flow (hours {named}).\n  Newton's method ends with the largest mismatch at bus {worst}.\n"
+        f"flow (hours {in_ranges(solved.hours[failed])}).\n  Newton's method ends with the largest mismatch "
+        f"at bus {worst}.\n"
         "Ways out: check loads, reactive limits and voltage set points, leave these hours out, or "
         "voltage=None for line limits alone."
     )

@@ -200,6 +200,26 @@ def test_front_runs_from_the_largest_total_to_the_largest_least_size(lines: Host
     assert (np.diff(slopes) < 1e-3).all()  # concave: each further MW for the smallest costs more
 
 
+def test_a_front_without_conflict_is_one_plan() -> None:
+    """Two sites, each behind a line of its own: the largest total has the largest least size."""
+    apart = HostingProblem(NETWORK, (21, 108), DAY, rating_scale=0.6, voltage=None)
+    (only,) = apart.pareto(6)
+    assert only.by_site == apart.solve().by_site
+    assert min(only.by_site.values()) == pytest.approx(apart.solve(objective=MaxMin()).objective, rel=1e-6)
+
+
+def test_a_front_that_jumps_has_each_plan_once(problem: HostingProblem) -> None:
+    """Site 21 opens only beside a small 106: the least size jumps from 0 to what it then is."""
+    row = Row({21: 0.002, 106: -0.003}, 0.02, "loss 21", 21)
+    front = problem.pareto(6, rows=[row])
+    total = np.array([plan.total_mw for plan in front])
+    least = np.array([min(plan.by_site.values()) for plan in front])
+    assert least[0] == 0
+    assert len(front) < 6
+    assert (np.diff(total) < -1e-3).all()
+    assert (np.diff(least) > 1e-3).all()
+
+
 def test_site_without_room_does_not_count_in_the_least_size(problem: HostingProblem) -> None:
     plan = problem.solve(bounds={21: (0.0, 0.0)}, objective=MaxMin())
     assert plan.by_site[21] == 0
@@ -346,6 +366,16 @@ def test_smallest_sizes_that_do_not_fit_are_told_with_what_does() -> None:
     assert fits.solve(bounds={b: (mw - 0.1, 500.0) for b, mw in sizes.items()}, must_open=(21, 75, 106))
     with pytest.raises(InfeasibleError):
         fits.solve(bounds={b: (mw + 0.1, 500.0) for b, mw in sizes.items()}, must_open=(21, 75, 106))
+
+
+def test_smallest_size_that_a_margin_forbids_names_the_margin() -> None:
+    sized = HostingProblem(NETWORK, SITES, DAY, rating_scale=0.6, min_size=20.0, reactive_limits=False)
+    with pytest.raises(InfeasibleError) as error:
+        sized.solve([Row({75: -1.0}, -10.0, "voltage at 75, fault 80", 75, "pu")], must_open=(75,))
+    assert str(error.value) == (
+        "The smallest sizes of the sites that must be open exceed the limits: 20 MW at 75. At most 50.0 % of "
+        "them fit together, by row voltage at 75, fault 80. Ways out: smaller sizes, or let a site close."
+    )
 
 
 def test_sites_may_be_smaller_than_their_least_only_when_closed() -> None:

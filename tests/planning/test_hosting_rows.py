@@ -13,7 +13,9 @@ import pytest
 
 from dcvrt.errors import InfeasibleError, InputError
 from dcvrt.grid.network import Network
-from dcvrt.planning import HostingProblem, Row, profiles
+from dcvrt.planning import N1, HostingProblem, MaxTotal, Row, profiles
+from dcvrt.planning.base_case import base_case, short_hours
+from dcvrt.planning.certificate import Hours
 from tests.grid.native.cases import network
 from tests.planning.test_hosting import solve_file
 
@@ -136,15 +138,88 @@ def test_file_with_rows_and_choices_has_the_same_optimum(tmp_path: Path) -> None
 
 
 def test_smallest_size_closes_a_site_that_cannot_reach_it() -> None:
-    small = HostingProblem(
-        NETWORK, SITES, YEAR, rating_scale=0.6, min_size={21: 40.0, 75: 0.0, 106: 0.0, 108: 0.0}
-    )
-    plan = small.solve()
+    """The largest size that is told is no less than what the site has in any plan."""
+    sizes = {21: 40.0, 75: 0.0, 106: 0.0, 108: 0.0}
+    plan = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, min_size=sizes).solve()
     assert plan.by_site[21] == 0.0
-    alone = HostingProblem(NETWORK, (21,), YEAR, rating_scale=0.6).solve().total_mw
-    reason = plan.closed[21]
-    assert reason.startswith("its smallest size is 40 MW, but the limits leave it at most ")
-    assert alone - 0.01 <= float(reason.split()[-4]) < 40
+    free = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+    most = free.solve(objective=MaxTotal({75: 0.0, 106: 0.0, 108: 0.0})).by_site[21]
+    assert plan.closed[21] == (
+        f"its smallest size is 40 MW, but the limits leave it at most {most:.4g} MW whatever the other "
+        "sites host"
+    )
+    assert free.solve().by_site[21] <= most + 1e-3
+    assert not free.allows({21: most + 0.05})
+
+
+def test_largest_size_of_a_site_leaves_the_problem_as_it_was() -> None:
+    asked = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6)
+    before = asked.solve()
+    slope = asked.screen.slope.copy() if asked.screen is not None else None
+    most = asked.largest(75)
+    assert most >= before.by_site[75]
+    assert asked.screen is not None
+    assert np.array_equal(slope, asked.screen.slope)
+    assert asked.solve().by_site == pytest.approx(before.by_site, abs=1e-4)
+
+
+def test_smallest_sizes_that_no_site_can_have_are_no_plan() -> None:
+    large = HostingProblem(
+        NETWORK,
+        (21, 75),
+        YEAR,
+        rating_scale=0.6,
+        min_size={21: 90.0, 75: 300.0},
+        reactive_limits=False,
+    )
+    with pytest.raises(InfeasibleError) as error:
+        large.solve()
+    one, two = (f"{large.largest(bus):.4g}" for bus in (21, 75))
+    assert str(error.value) == (
+        "ieee118: no site can be opened, as the smallest sizes exceed the limits.\n"
+        f"  site 21: at least 90 MW, at most {one} MW fit whatever the others host\n"
+        f"  site 75: at least 300 MW, at most {two} MW fit whatever the others host\n"
+        "Ways out: smaller min_size, or wider limits."
+    )
+    one_fits = HostingProblem(
+        NETWORK,
+        (21, 75),
+        YEAR,
+        rating_scale=0.6,
+        min_size={21: 90.0, 75: large.largest(75) - 1.0},
+        reactive_limits=False,
+    )
+    assert one_fits.solve().by_site[75] > 0
+
+
+def test_a_site_that_gains_nothing_is_told_the_limits_in_its_way() -> None:
+    """Bus 117 hangs on one branch that is full with its own load in the peak hour."""
+    lines = NETWORK.branches
+    rating = lines.rating.copy()
+    rating[(lines.from_bus == 117) | (lines.to_bus == 117)] = 20.0 / 0.6
+    full = HostingProblem(NETWORK.with_ratings(rating), (75, 117), YEAR, rating_scale=0.6, voltage=None)
+    plan = full.solve()
+    assert len(plan.binding) > 3
+    assert plan.closed[117] == (
+        "hosting here gains nothing within the shared limits (line 12-117 in hour 8441)"
+    )
+
+
+def test_a_range_without_any_of_its_sizes_is_told_as_such() -> None:
+    sized = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, min_size=20.0, reactive_limits=False)
+    closed = sized.solve(bounds={75: (0.0, 10.0)}).closed
+    assert closed[75] == "the range given to it holds none of its sizes, 20 to 500 MW"
+    free = HostingProblem(
+        NETWORK,
+        SITES,
+        YEAR,
+        rating_scale=0.6,
+        h_max={21: 0.0, 75: 500.0, 106: 500.0, 108: 500.0},
+        reactive_limits=False,
+    )
+    closed = free.solve(bounds={75: (0.0, 0.0)}).closed
+    assert closed[75] == "the range given to it holds no size above 0 MW"
+    assert closed[21] == "its largest size is 0 MW"
 
 
 def test_bounds_narrow_the_sizes_of_open_sites(problem: HostingProblem) -> None:
@@ -295,8 +370,7 @@ def test_overloaded_base_case_names_hours_lines_and_amount() -> None:
         HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.4, voltage=None).solve()
     first, worst, way = str(error.value).splitlines()
     assert first == (
-        "ieee118: the base case has no dispatch in 3 of 24 hours (hours 8440, 8441, 8442) "
-        "with nothing hosted."
+        "ieee118: the base case has no dispatch in 3 of 24 hours (hours 8440-8442) with nothing hosted."
     )
     assert worst == (
         "  Worst hour 8442: branches are overloaded by 1.709 MW whatever the dispatch: "
@@ -308,6 +382,57 @@ def test_overloaded_base_case_names_hours_lines_and_amount() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("scale", "rule", "hours"),
+    [(0.38, None, range(8200, 8600)), (0.6, N1(1.0), range(8400, 8460)), (0.25, None, range(0, 8760, 60))],
+)
+def test_short_hours_and_the_worst_of_them_are_those_of_every_hour_solved(
+    scale: float, rule: N1 | None, hours: range
+) -> None:
+    network = NETWORK.with_ratings(NETWORK.branches.rating * scale)
+    year = profiles.ieee118().window(hours)
+    short = short_hours(Hours(network, network.indices(SITES), year, rule=rule))
+    single = Hours(network, network.indices(SITES), year, hull=False, rule=rule)
+    mw = np.array([single.dispatch(np.zeros(len(SITES)), at).shortfall for at in range(len(year))])
+    assert short.all_seen
+    assert short.worst_known
+    assert short.at.tolist() == np.flatnonzero(mw > single.tolerance).tolist()
+    worst = next(iter(short.solved.values()))
+    assert worst.shortfall == pytest.approx(mw.max(), abs=1e-6)
+
+
+def test_the_worst_hour_is_not_claimed_where_too_many_are_short() -> None:
+    network = NETWORK.with_ratings(0.15 * NETWORK.branches.rating)
+    year = profiles.ieee118().window(range(6000, 6700))
+    every = Hours(network, network.indices(SITES), year, hull=False)
+    short = short_hours(every)
+    assert not short.worst_known
+    assert 300 <= len(short.solved) < len(short.at)
+    assert f"\n  Worst of {len(short.solved)} hours solved, hour " in base_case(every, 0.15)
+
+
+def test_base_case_that_outages_overload_names_them_and_the_other_branches() -> None:
+    """Radial: 1-2 carries 50 MW twice over in the first hour, 1-3 is full in the second."""
+    three = network(
+        {1: "slack", 2: "pq", 3: "pq"},
+        [(1, 2, complex(0.0, 0.1)), (1, 2, complex(0.0, 0.1)), (1, 3, complex(0.0, 0.1))],
+        {1: 500.0},
+        {2: 100.0},
+    )
+    rated = three.with_ratings(np.array([60.0, 60.0, 40.0]))
+    wind = {3: np.array([0.0, 50.0])}
+    year = profiles.Year(np.arange(2), np.array([1.0, 0.55]), wind, np.ones(2))
+    with pytest.raises(InfeasibleError) as error:
+        HostingProblem(rated, (3,), year, voltage=None, security=N1(1.2)).solve()
+    assert str(error.value).splitlines()[1:] == [
+        "  Worst hour 0: branches are overloaded by 28 MW whatever the dispatch: 1-2 (rated 72 MVA after the "
+        "outage of 1-2).",
+        "  In other hours: 1-3 (with others by 10 MW in hour 1).",
+        "Ways out: a larger rating_scale (now 1), a larger factor on ratings after an outage (now 1.2), or "
+        "more generation behind these branches, or leave these hours out.",
+    ]
+
+
 def test_base_case_without_enough_units_says_so() -> None:
     units = NETWORK.generators
     weak = replace(NETWORK, generators=replace(units, p_max=0.35 * units.p_max))
@@ -315,7 +440,7 @@ def test_base_case_without_enough_units_says_so() -> None:
         HostingProblem(weak, SITES, YEAR, rating_scale=10.0, voltage=None).solve()
     lines = str(error.value).splitlines()
     assert lines[0].startswith(
-        "ieee118: the base case has no dispatch in 10 of 24 hours (hours 8433, 8434, 8435, "
+        "ieee118: the base case has no dispatch in 10 of 24 hours (hours 8433-8437, 8440-8444) "
     )
     assert lines[1] == (
         "  Worst hour 8442: units that give 0 to 3488.2 MW cannot meet a net load of 3835.4 MW "
@@ -329,10 +454,10 @@ def test_voltages_outside_the_limits_before_hosting_are_named() -> None:
         HostingProblem(NETWORK, SITES, YEAR, voltage=(0.95, 1.06), reactive_limits=False).solve()
     lines = str(error.value).splitlines()
     assert lines[0] == "ieee118: with nothing hosted 3 bus(es) are outside the voltage limits 0.95-1.06 pu."
-    assert lines[1] == "  bus 53: outside in 14 hours, worst 0.9459 pu in hour 8441"
+    assert lines[1] == "  bus 53: outside in 14 hours (8431-8444), worst 0.9459 pu in hour 8441"
     assert lines[3] == "  bus 76: holds its set point 0.9430 pu"
     assert lines[-1] == (
-        "Ways out: wider limits (voltage=...), other set points, or base_violations='hold', with which "
+        "Ways out: wider voltage limits, other set points, or base_violations='hold', with which "
         "these voltages must only not get worse."
     )
 
