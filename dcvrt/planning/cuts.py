@@ -239,6 +239,10 @@ class Knowledge:
             f"{self.label(key)} (by sequence)" if by_sequence else self.label(key),
             site=None if owner is None else self.sites[owner],
             unit="MW" if by_sequence else unit,
+            period=key[0],
+            fault=key[1],
+            mode=self.run[0],
+            target=self.requirement.target(key[2]),
         )
 
 

@@ -43,7 +43,7 @@ class Row:
         Largest value. A limit on the aggregate loss of a fault is `Row(shares, -inf, label, upper=mw)`.
     rating : mapping of bus number to float
         c_j, of the converter ratings S_j in MVA; needs a `Rating` in `solve`.
-    fault, mode, target : str
+    period, fault, mode, target : str
         What the requirement was made from; carried over to what binds.
     """
 
@@ -57,6 +57,7 @@ class Row:
     fault: str = ""
     mode: str = ""
     target: str = ""
+    period: str = ""
 
     def value(self, by_site: Mapping[int, float], rating: Mapping[int, float] | None = None) -> float:
         """Distance to the nearer limit at given capacities and ratings: negative when violated."""
@@ -89,8 +90,8 @@ class Binding:
         Bus of a voltage, a unit or a site.
     outage : str
         Branch whose outage the limit of a line follows; empty for the intact network.
-    fault, mode, target : str
-        Those of the row.
+    period, fault, mode, target : str
+        Those of the row; its period stands for the hour.
     """
 
     kind: str
@@ -104,6 +105,7 @@ class Binding:
     fault: str = ""
     mode: str = ""
     target: str = ""
+    period: str = ""
 
     def __str__(self) -> str:
         when = "" if self.hour is None else f" in hour {self.hour}"
@@ -218,7 +220,7 @@ class Plan:
         import pandas as pd
 
         columns = ["kind", "label", "hour", "bus", "price", "unit", "limit"]
-        columns += ["outage", "fault", "mode", "target"]
+        columns += ["outage", "period", "fault", "mode", "target"]
         return pd.DataFrame([[getattr(b, c) for c in columns] for b in self.binding], columns=columns)
 
 

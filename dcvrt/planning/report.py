@@ -118,6 +118,7 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
                     fault=row.fault,
                     mode=row.mode,
                     target=row.target,
+                    period=row.period,
                 )
             )
     if len(solution.S):

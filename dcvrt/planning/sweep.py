@@ -89,6 +89,7 @@ def margin_rows(
                     fault=str(fit.fault),
                     mode=fit.mode,
                     target=fit.target,
+                    period=period,
                 )
             )
     return [row for row in rows if row.site not in closed], closed

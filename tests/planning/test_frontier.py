@@ -10,6 +10,7 @@ import pytest
 
 from dcvrt.errors import InputError
 from dcvrt.planning.exact import Run
+from dcvrt.planning.plan import Row
 from dcvrt.planning.requirement import EverySite
 from dcvrt.planning.search import Found
 from tests.planning import closed_form
@@ -40,6 +41,30 @@ def affine(a: np.ndarray, b: np.ndarray) -> Margins:
         return value, slope, ["NORMAL"] * n
 
     return margins
+
+
+def test_rows_of_the_search_name_what_they_are_made_from() -> None:
+    """A separation's row does, too: it stands for the same margin."""
+
+    def margins(H: np.ndarray, fault: str, beta: float) -> tuple[np.ndarray, np.ndarray, list[str]]:
+        value, slope, _ = affine(np.array([0.1]), np.array([[1e-4]]))(H, fault, beta)
+        if H[0] <= 60.0:
+            return value, slope, ["NORMAL"]
+        return value - [0.0, 0.5], slope, ["BATTERY"]
+
+    programme = Programme(1, 1e9)
+    asked: list[Row] = []
+    plain = programme.solve
+
+    def solve(rows: Sequence[Row] = (), **others: object) -> closed_form.Answer:
+        asked.extend(rows)
+        return plain(rows, **others)
+
+    programme.solve = solve
+    search(programme, Oracle(programme, margins, ["a"]), [200.0])
+    assert any(row.label.endswith("(by sequence)") for row in asked)
+    named = {(row.site, row.period, row.fault, row.mode, row.target) for row in asked}
+    assert named == {(1, PERIOD, "a", "gfl", "loss")}
 
 
 def test_affine_margins_are_met_exactly_with_one_candidate() -> None:

@@ -212,7 +212,7 @@ def test_largest_size_binds_with_a_price_of_one() -> None:
     assert str(plan.binding[2]) == "bound largest size of site 21: 1 MW/MW"
     assert list(plan.table().columns) == [
         *("kind", "label", "hour", "bus", "price", "unit", "limit"),
-        *("outage", "fault", "mode", "target"),
+        *("outage", "period", "fault", "mode", "target"),
     ]
 
 

@@ -70,6 +70,8 @@ def test_rows_are_the_surrogate_in_every_period() -> None:
     for row, d in zip(rows, D.values(), strict=True):
         assert row.value(H) == pytest.approx(-1.0 + d * (-0.02 * 80 + 0.01 * 30) + 0.05 * 1.2 * 80)
     assert rows[0].label == "loss at bus 75, fault bus 32, 100 ms, peak, gfl, beta 1.2"
+    assert [row.period for row in rows] == list(D)
+    assert {(row.fault, row.mode, row.target) for row in rows} == {("bus 32, 100 ms", "gfl", "loss")}
 
 
 @pytest.mark.parametrize(
