@@ -74,24 +74,29 @@ def ask(
     """
     rows = tuple(rows)
     objective = MaxTotal() if objective is None else objective
-    lower, upper = _within(bounds, sites, lower, upper)
-    raise_all(row_faults(rows, sites, rating), "requirement rows")
-    problems = objective.faults(sites) + ([] if rating is None else rating.faults())
-    problems += [
+    lower, upper, outside = _within(bounds, sites, lower, upper)
+    wanted = objective.faults(sites) + ([] if rating is None else rating.faults())
+    wanted += [
         f"must_open names {bus!r}, which is not a site.{did_you_mean(bus, sites)}"
         for bus in must_open
         if bus not in sites
     ]
-    raise_all(problems, "objective")
+    found = {"bounds": outside, "requirement rows": row_faults(rows, sites, rating), "objective": wanted}
+    wrong = {part: problems for part, problems in found.items() if problems}
+    if len(wrong) > 1:
+        raise_all([f"{part}: {line}" for part, lines in wrong.items() for line in lines], "hosting problem")
+    for part, problems in wrong.items():
+        raise_all(problems, part)
     forced = np.array([bus in set(must_open) for bus in sites])
     return Question(sites, lower, upper, rows, objective, rating, forced)
 
 
 def _within(
     bounds: Mapping[int, tuple[float, float]], sites: tuple[int, ...], least: Floats, largest: Floats
-) -> tuple[Floats, Floats]:
-    """Sizes of the sites, narrowed to the ranges given to some of them."""
-    lower, upper, problems = least.copy(), largest.copy(), []
+) -> tuple[Floats, Floats, list[str]]:
+    """Sizes of the sites, narrowed to the ranges given to some of them, and what is wrong with these."""
+    lower, upper = least.copy(), largest.copy()
+    problems: list[str] = []
     for bus, (low, high) in bounds.items():
         if bus not in sites:
             problems.append(f"{bus!r} is not a site.{did_you_mean(bus, sites)}")
@@ -109,5 +114,4 @@ def _within(
                     f"the range of site {bus}, {low:g} to {high:g} MW, has nothing in common with "
                     f"its sizes {least[i]:g} to {largest[i]:g} MW."
                 )
-    raise_all(problems, "bounds")
-    return lower, upper
+    return lower, upper, problems

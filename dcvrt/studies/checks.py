@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -55,23 +56,25 @@ def check(text: str, where: str, folder: Path) -> StudyFile:
     InputError
         One error with every problem.
     """
-    file, sections, problems = read(text, where)
-    problems += contradictions(sections)
-    network, found = read_network(sections.get("grid"), folder)
-    problems += found
+    file, sections, withheld, problems = read(text, where)
+    found = contradictions(sections)
+    network, more = read_network(sections.get("grid"), folder)
+    found += more
     if network is not None:
-        problems += unknown_buses(sections, network) + wrong_branches(sections, network)
+        found += unknown_buses(sections, network) + wrong_branches(sections, network)
     hosting = sections.get("hosting")
     year = None
-    if hosting is not None:
-        year, found = _try_profiles(hosting, folder)
-        problems += found
+    if hosting is not None and not withheld & {"profiles", "hours"}:
+        year, more = _try_profiles(hosting, folder)
+        found += more
         if year is not None:
-            problems += unknown_hours(sections, year, network)
-    problems += outside_ranges(sections, year, network)
+            found += unknown_hours(sections, year, network)
+    found += outside_ranges(sections, year, network)
     if "facility" in sections:
-        problems += unknown_variants(sections["facility"])
-        problems += wrong_sensitivity(sections)
+        found += unknown_variants(sections["facility"])
+        found += wrong_sensitivity(sections)
+    # Fields that are wrong by themselves stand at their defaults in these checks.
+    problems += [line for line in found if withheld.isdisjoint(re.findall(r"\w+", line))]
     raise_all(problems, where)
     assert file is not None
     return file
@@ -129,7 +132,7 @@ def contradictions(sections: Mapping[str, Any]) -> list[str]:
         criteria: CriteriaSection | None = sections.get("criteria")
         if criteria is not None:
             problems += [
-                f"criteria.{name} = {value:g}: is longer than the simulation of {grid.t_end_s:g} s."
+                f"criteria.{name} = {value:g}: is longer than grid.t_end_s = {grid.t_end_s:g}."
                 for name, value in (
                     ("window_ms", criteria.window_ms),
                     ("loss_window_ms", criteria.loss_window_ms),

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
+from copy import deepcopy
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -316,7 +318,7 @@ def schema() -> str:
     return json.dumps(StudyFile.model_json_schema(), indent=2)
 
 
-def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], list[str]]:
+def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], set[str], list[str]]:
     """Read the text of a study file as far as it can be read.
 
     Returns
@@ -324,7 +326,9 @@ def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], list[
     file : StudyFile or None
         None when something is wrong.
     sections : dict
-        The sections that are right by themselves, for the checks across fields.
+        For the checks across fields: sections that can be without the fields that are wrong by themselves.
+    withheld : set of str
+        These fields, and those that unknown ones were meant for: nothing is to be said of them.
     problems : list of str
         One line each, starting with the path of the field.
 
@@ -343,12 +347,17 @@ def read(text: str, where: str) -> tuple[StudyFile | None, dict[str, Any], list[
         if key not in StudyFile.model_fields
     ]
     sections: dict[str, Any] = {}
+    withheld: set[str] = set()
     for name in StudyFile.model_fields:
         try:
             sections[name] = _one_field(name, raw)
         except ValidationError as error:
             problems += _merged([_sentence(name, raw, item) for item in error.errors()])
-    return (None if problems else StudyFile(**sections)), sections, problems
+            rest, wrong = _without_wrong_fields(name, raw, error)
+            withheld |= wrong
+            if rest is not None:
+                sections[name] = rest
+    return (None if problems else StudyFile(**sections)), sections, withheld, problems
 
 
 def load(text: str, where: str) -> StudyFile:
@@ -361,7 +370,7 @@ def load(text: str, where: str) -> StudyFile:
       fault: at least one [[fault]] is required.
       period: at least one [[period]] is required.
     """
-    file, _, problems = read(text, where)
+    file, _, _, problems = read(text, where)
     raise_all(problems, where)
     assert file is not None
     return file
@@ -374,6 +383,27 @@ def _one_field(name: str, raw: Mapping[str, Any]) -> Any:
         return field.get_default()
     kind: Any = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     return TypeAdapter(kind).validate_python(raw.get(name, _Missing))
+
+
+def _without_wrong_fields(name: str, raw: Mapping[str, Any], error: ValidationError) -> tuple[Any, set[str]]:
+    """A table without the fields that are wrong by themselves, and their names; None where it needs them."""
+    data: Any = deepcopy(raw.get(name))
+    wrong: set[str] = set()
+    for item in error.errors():
+        path: list[Any] = list(item["loc"])
+        entry = data
+        if isinstance(data, list) and path and isinstance(path[0], int):
+            entry = data[path.pop(0)]
+        if not path or not isinstance(entry, dict):
+            return None, set()
+        entry.pop(path[0], None)
+        wrong.add(str(path[0]))
+        if item["type"] == "extra_forbidden":
+            wrong.update(get_close_matches(str(path[0]), _known_fields(name), n=1))
+    try:
+        return _one_field(name, {name: data}), wrong
+    except ValidationError:
+        return None, set()
 
 
 class _Missing:
@@ -446,20 +476,13 @@ def _merged(sentences: list[str]) -> list[str]:
 
 
 def _known_fields(name: str) -> list[str]:
-    entry: Any = {"fault": FaultEntry, "period": PeriodEntry}.get(
-        name, StudyFile.model_fields[name].annotation
-    )
-    return [field for field in entry.model_fields]
+    entries = {"fault": FaultEntry, "period": PeriodEntry}
+    entry: Any = entries.get(name, StudyFile.model_fields[name].annotation)
+    return list(entry.model_fields)
 
 
 def read_text(path: Path) -> str:
-    """Text of a study file.
-
-    Raises
-    ------
-    InputError
-        When there is no such file or it is not UTF-8.
-    """
+    """Text of a study file; raises `InputError` when there is no such file or it is not UTF-8."""
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

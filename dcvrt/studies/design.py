@@ -346,7 +346,8 @@ FOOTER = """\
 Margins by the replay: voltage in pu, loss as a share of the import. Each
 parameter alone, the others as in the study. Where events change or a margin
 jumps, gradients say nothing; the value is the side that was run and passed.
-Open loop: a facility does not act back on the grid in a fault."""
+Open loop: a facility does not act back on the grid in a fault.
+Whether the grid can carry these capacities otherwise is a question to a study."""
 
 
 def header(setting: Setting, ask: Ask) -> str:

@@ -239,6 +239,14 @@ def test_objectives_are_refused_with_all_faults(problem: HostingProblem) -> None
         f"  must_open names 5, which is not a site. Did you mean '75'? {known}"
     )
     with pytest.raises(InputError) as error:
+        problem.solve([Row({5: 1.0}, 0.0, "odd")], {75: (5.0, 1.0)}, must_open=(6,))
+    assert str(error.value) == (
+        "hosting problem: 3 problems\n"
+        "  bounds: the range of site 75 is 5 to 1 MW; it must be ascending and not negative.\n"
+        f"  requirement rows: row 'odd' names 5, which is not a site. Did you mean '75'? {known}\n"
+        f"  objective: must_open names 6, which is not a site. {known}"
+    )
+    with pytest.raises(InputError) as error:
         problem.pareto(1)
     assert str(error.value) == "pareto: 1 points; a front has at least 2."
 

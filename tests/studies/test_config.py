@@ -9,6 +9,7 @@ import pytest
 
 from dcvrt import facility
 from dcvrt.errors import InputError
+from dcvrt.grid.network import Network
 from dcvrt.planning import replay
 from dcvrt.planning.security import N1
 from dcvrt.studies import checks, config
@@ -99,6 +100,60 @@ def test_every_mistake_of_fields_is_told_at_once() -> None:
         "  fault[1].t_clear_ms = -5.0: must be above 0.\n"
         "  period[1].hour = 'peek': must be a whole number, or 'peak', 'median' or 'light'."
     )
+
+
+def test_a_mistake_of_one_field_hides_none_across_fields() -> None:
+    """What is wrong by itself stands out of the checks across fields, a mistyped name too."""
+    text = changed(
+        ("sites = [21, 75, 106, 108]", "sites = [21, 75, 75, 999]"),
+        ("t_end_s = 2.0", "t_end_s = -2.0"),
+        ("pf = 0.98", "pf = 1.2"),
+        ("h_max_mw = 500.0", "h_max_mww = 900.0"),
+        ("min_size_mw = 0.0", "min_size_mw = [600.0, 1.0]"),
+        ("v_min_pu = 0.94", "v_min_pu = 1.07"),
+        ("t_clear_ms = 100.0", "t_clear_ms = 1e4\nx_pu = 0.0"),
+        ("bus = 111 ", "bus = 21 "),
+        ('modes = ["gfl", "gfm"]', 'modes = ["gfk", "gfm"]'),
+        ("beta = [1.0, 1.05,", "beta = [-1.0, 1.05,"),
+    )
+    known = ", ".join(map(str, Network.ieee118().bus[:12]))
+    assert complaint(text).splitlines() == [
+        "my.toml: 11 problems",
+        "  grid.t_end_s = -2.0: must be above 0.",
+        "  hosting.pf = 1.2: must be at most 1.",
+        "  hosting.h_max_mww: unknown field. Did you mean 'h_max_mw'? Known: profiles, hours, pf, "
+        "rating_scale, v_min_pu, v_max_pu, reactive_limits, h_max_mw, min_size_mw, n1_rating_factor, "
+        "base_violations.",
+        "  facility.beta[1] = -1.0: must be above 0.",
+        "  fault[1].x_pu = 0.0: must be above 0.",
+        "  grid.sites: bus 75 is listed more than once.",
+        "  fault[6].bus = 21: is a candidate bus; a site cannot ride through a fault at its own terminals. "
+        "Way out: take a neighbouring bus, or drop it from grid.sites.",
+        "  hosting.min_size_mw: 2 values for 4 sites.",
+        "  hosting.v_min_pu = 1.07: must be below v_max_pu = 1.06.",
+        f"  grid.sites[4] = 999: ieee118 has no such bus. Did you mean '99'? Known: {known}, "
+        "... (118 in all).",
+        "  facility.modes: no variant 'gfk'. Did you mean 'gfm'? Known: gfl, gfm, gfm-droop, "
+        "line-interactive, eco-mode, no-ups, gfl-vfd-cooling, gfl-sag-counter, gfl-support.",
+    ]
+
+
+def test_a_wrong_field_is_not_judged_by_its_default() -> None:
+    """600 MW exceed the default of h_max_mw, and 3 s that of t_end_s, which both were to be others."""
+    text = changed(
+        ("t_end_s = 2.0", 't_end_s = "5 s"'),
+        ("h_max_mw = 500.0", "h_max_mww = 900.0"),
+        ("min_size_mw = 0.0", "min_size_mw = 600.0"),
+        ("t_clear_ms = 100.0", "t_clear_ms = 3e3"),
+        ("window_ms = 20.0", "window_ms = 3e3"),
+        ('profiles = "ieee118"', "profiles = 3"),
+        ('hour = "light"', "hour = 9000"),
+    )
+    assert [line.split(":")[0].strip() for line in complaint(text).splitlines()[1:]] == [
+        "grid.t_end_s = '5 s'",
+        "hosting.profiles = 3",
+        "hosting.h_max_mww",
+    ]
 
 
 def test_system_limits_have_to_rise_and_to_be_at_ratings_of_the_study() -> None:
