@@ -150,7 +150,8 @@ class Agreement:
                 f"{screen.network.bus[screen.moving[bus]]} in hour {screen.year.hours[hours[k]]}. "
                 "Ways out: a smaller h_max, or voltage_screen='one-shot' with check_ac."
             )
-        self._linearise(H, look)
+        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
+        self._linearise(H, look, tangents)
         place = {int(hour): k for k, hour in enumerate(hours)}
 
         def stays(cut: Cut) -> bool:
@@ -161,18 +162,19 @@ class Agreement:
                 return look.expected is None
             return t.bounds(H, size[t.bus, place[t.hour]])
 
-        tangents = [cut.origin for cut in master.cuts if isinstance(cut.origin, Tangent)]
         moved = [t.key for t in tangents if t.hour in place or look.expected is not None]
         renewed = [screen.tangent(*key) for key in dict.fromkeys(moved)]
         master.cuts = [cut for cut in master.cuts if stays(cut)]
         master.cuts += [Cut(*t.cut(), origin=t) for t in renewed]
         return False
 
-    def _linearise(self, H: Floats, look: _Look) -> None:
-        """Move the screen to `H`."""
+    def _linearise(self, H: Floats, look: _Look, tangents: list[Tangent]) -> None:
+        """Move the screen to `H`, with new slopes where a voltage is near a limit or a tangent has it there:
+        one made beyond the corner at which a unit leaves its limit would come back pass after pass."""
         size = self.screen.sizes(look.solved)
         room = self.screen.room(size, np.arange(len(size)), look.hours)
-        steep = np.flatnonzero(room.min(axis=0) < STEEP)
+        tight = np.isin(look.hours, [t.hour for t in _tight(tangents, H)])
+        steep = np.flatnonzero((room.min(axis=0) < STEEP) | tight)
         self.screen.relinearise(H, look.hours, look.solved, steep, look.rows, look.expected)
 
     def allows(self, H: Floats, tangents: list[Tangent]) -> bool:
@@ -186,7 +188,7 @@ class Agreement:
             return False
         if self._overstates(look) <= AGREED_AT_LIMITS:
             return True
-        self._linearise(H, look)
+        self._linearise(H, look, tangents)
         return False
 
     def restart(self, H: Floats, master: Master) -> bool:

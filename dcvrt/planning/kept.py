@@ -53,6 +53,7 @@ def lower_bound(x: Floats, m: Floats) -> Floats:
     >>> lower_bound(x, np.array([0.0, 2.0, 1.0])).round(6).tolist() == [0.0, 0.5]
     True
     """
+    import highspy
     import scipy.sparse as sp
 
     scale = np.maximum(abs(x).max(axis=0), 1e-300)
@@ -69,6 +70,8 @@ def lower_bound(x: Floats, m: Floats) -> Floats:
         )
     )
     solver.run()
+    if solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
+        raise RuntimeError(f"HiGHS ended a lower bound with {solver.getModelStatus()}.")
     k = np.array(solver.getSolution().col_value) / scale
     k[0] -= max(0.0, float((x @ k - m).max()))  # the solver's own tolerance
     return np.asarray(k)

@@ -79,7 +79,7 @@ class Binding:
     price : float
         Hosted MW gained per unit by which the limit is relaxed (0 where it binds without a price); with
         weights or a cost of ratings, what the objective gains. Of a `rating`: per MVA of converter that the
-        site had more at the same capacity.
+        site had more at the same capacity, by the rows that it helps to meet.
     unit : str
         Unit of the price.
     limit : float

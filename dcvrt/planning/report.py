@@ -122,9 +122,12 @@ def _binding(problem: HostingProblem, master: Master, solution: Solution) -> tup
                 )
             )
     if len(solution.S):
-        worth = -solution.row_dual @ master.coefficients[:, master.count : 2 * master.count]
+        helps = -solution.row_dual[:, None] * master.coefficients[:, master.count : 2 * master.count]
+        worth = np.maximum(helps, 0.0).sum(
+            axis=0
+        )  # what a budget of ratings takes for it stands with the budget
         for bus, price, mva in zip(master.sites, worth, solution.S, strict=True):
-            if abs(price) > NO_PRICE:
+            if price > NO_PRICE:
                 add(Binding("rating", f"rating of site {bus}", float(price), "MW/MVA", float(mva), bus=bus))
     for what, prices, limits in (
         ("largest", solution.bound_price, master.upper),
@@ -182,15 +185,14 @@ def _flow_bindings(problem: HostingProblem, cut: FlowCut, price: float) -> list[
 def _in_the_way(problem: HostingProblem, master: Master, solution: Solution, site: int) -> Sequence[Binding]:
     """Limits with a price that hosting at a site would lean on, those first that a MW there costs most."""
     cost = np.array([max(cut.a[site], 0.0) for cut in solution.cuts])
+    leans = master.coefficients[:, site].copy()
+    if len(solution.S):  # a capacity takes a rating with it
+        leans += master.coefficients[:, master.count + site]
     per_mw = replace(
         solution,
         S=np.zeros(0),
         cut_price=solution.cut_price * cost,
-        row_dual=np.where(
-            solution.row_dual * master.coefficients[:, site] > 0,
-            solution.row_dual * abs(master.coefficients[:, site]),
-            0.0,
-        ),
+        row_dual=np.where(solution.row_dual * leans > 0, solution.row_dual * abs(leans), 0.0),
         bound_price=np.zeros(master.count),
         floor_price=np.zeros(master.count),
     )

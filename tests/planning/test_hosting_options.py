@@ -305,7 +305,7 @@ def test_price_of_a_rating_equals_a_difference(problem: HostingProblem) -> None:
 def test_price_of_a_criterion_and_of_a_budget_equal_differences(problem: HostingProblem) -> None:
     def plan(share: float = 0.0, mva: float = 0.0) -> tuple[float, dict[str, float]]:
         rows = margins(dict.fromkeys(SITES, share))
-        budget = Row({}, -np.inf, "budget", unit="MVA", upper=150.0 + mva, rating=dict.fromkeys(SITES, 1.0))
+        budget = Row({}, -np.inf, "budget", unit="MVA", upper=250.0 + mva, rating=dict.fromkeys(SITES, 1.0))
         found = problem.solve([*rows, budget], rating=Rating(1.0, 1.5))
         return found.total_mw, {b.label: b.price for b in found.binding if b.kind == "row"}
 
@@ -313,8 +313,29 @@ def test_price_of_a_criterion_and_of_a_budget_equal_differences(problem: Hosting
     assert "budget" in prices
     step = 1e-4
     criterion = sum(price for label, price in prices.items() if label.startswith("loss"))
+    assert criterion > 100
     assert (plan(step)[0] - plan(-step)[0]) / (2 * step) == pytest.approx(criterion, rel=1e-4)
     assert (plan(0.0, 0.01)[0] - plan(0.0, -0.01)[0]) / 0.02 == pytest.approx(prices["budget"], rel=1e-4)
+
+
+def test_price_of_a_rating_within_a_budget_is_what_its_margins_gain(problem: HostingProblem) -> None:
+    """The budget has a price of its own: a rating is not told to cost what it takes from there."""
+    limit = {"unit": "MVA", "rating": dict.fromkeys(SITES, 1.0)}
+    budget, ratio, step = Row({}, -np.inf, "budget", upper=250.0, **limit), Rating(1.0, 1.5), 1e-2
+    plan = problem.solve([*margins(), budget], rating=ratio)
+    priced = {b.bus: b.price for b in plan.binding if b.kind == "rating"}
+    assert len(priced) >= 2
+    for bus, price in priced.items():
+        assert price > 0
+        up, down = (
+            problem.solve([*margins({bus: sign * 2e-3 * step}), budget], rating=ratio).total_mw
+            for sign in (1, -1)
+        )
+        assert (up - down) / (2 * step) == pytest.approx(price, rel=1e-3)
+    small = problem.solve([*margins(), replace(budget, upper=150.0)], rating=ratio)
+    assert not [b for b in small.binding if b.kind == "rating"]
+    closed = next(bus for bus, mw in small.by_site.items() if mw == 0)
+    assert small.closed[closed] == "hosting here gains nothing within the shared limits (row budget)"
 
 
 def test_what_binds_names_fault_mode_and_target(problem: HostingProblem) -> None:

@@ -8,7 +8,7 @@ import pytest
 from dcvrt.grid import schedule
 from dcvrt.grid.network import Network
 from dcvrt.grid.powerflow import PowerFlow
-from dcvrt.planning import HostingProblem, Row, profiles
+from dcvrt.planning import HostingProblem, MaxTotal, Row, profiles
 from dcvrt.planning.agreement import GUARD
 from dcvrt.planning.interpolation import VoltageDrop
 from dcvrt.planning.voltage_screen import HostedFlow
@@ -160,3 +160,16 @@ def test_a_site_is_exchanged_for_a_better_one_of_which_linear_voltages_thought_l
     plan = problem.solve(rows)
     assert plan.total_mw >= other.total_mw - 2e-3
     assert problem.check_ac(plan).passed
+
+
+def test_an_objective_of_one_site_finds_its_way_past_the_corners_of_others() -> None:
+    """The unit at bus 76 holds 0.943 pu until it runs out of reactive power; a slope from beyond that point
+    has the voltage at its limit long before."""
+    pair = HostingProblem(NETWORK, (21, 75), WEEK, rating_scale=0.6)
+    plan = pair.solve(objective=MaxTotal({21: 0.0}))
+    assert plan.voltage is not None
+    assert plan.voltage.passes < 30
+    assert pair.check_ac(plan).passed
+    assert plan.by_site[75] > pair.solve().by_site[75]
+    for mw in (0.0, 1.0, 10.0, 20.0, 29.0):
+        assert not pair.allows({21: mw, 75: plan.by_site[75] + 0.02})
