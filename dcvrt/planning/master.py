@@ -368,7 +368,8 @@ class Master:
         sum; rows are weighed by their largest coefficient. None when the cuts alone exclude everything."""
         general = np.flatnonzero(self.always)
         cuts, count = self._cut_block(), len(general)
-        size = np.maximum(abs(self.coefficients[general]).max(axis=1, initial=0.0), 1e-300)
+        size = abs(self.coefficients[general]).max(axis=1, initial=0.0)
+        size[size == 0.0] = 1.0
         slack = np.hstack([np.diag(size), -np.diag(size)])
         matrix = np.block(
             [
@@ -402,6 +403,7 @@ class Master:
         for k, cut in enumerate(self.cuts):
             matrix[k, : self.count] = cut.a
         high = np.array([cut.b for cut in self.cuts], dtype=float)
+        high[~matrix.any(axis=1)] = np.inf  # a voltage that no capacity moves, linearised where it was lower
         return Block(matrix, np.full(len(high), -np.inf), high, [])
 
 
@@ -447,9 +449,10 @@ def _run(
 
     # Rows are scaled to a largest coefficient of 1, so that the solver's tolerance is one in MW.
     size = abs(matrix).max(axis=1, initial=0.0)
-    moot = size == 0.0  # a voltage that no capacity moves, linearised where it was lower
-    size[moot] = 1.0
-    low, high = np.where(moot, -np.inf, low), np.where(moot, np.inf, high)
+    empty = size == 0.0
+    if (empty & ((low > TOLERANCE) | (high < -TOLERANCE))).any():
+        return None
+    size[empty] = 1.0
     scaled = sp.csr_matrix(matrix / size[:, None])
     solver = _shared()
     solver.clearModel()

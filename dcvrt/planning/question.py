@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dcvrt.errors import did_you_mean, raise_all
 from dcvrt.planning.arguments import row_faults
 from dcvrt.planning.master import Master
-from dcvrt.planning.objective import MaxTotal, Objective, Rating
+from dcvrt.planning.objective import MaxMin, MaxTotal, Objective, Rating
 from dcvrt.planning.plan import Row
 
 Floats = npt.NDArray[np.float64]
@@ -81,6 +81,8 @@ def ask(
         for bus in must_open
         if bus not in sites
     ]
+    if isinstance(objective, MaxMin) and not wanted and not (objective.vector(sites)[upper > 0] > 0).any():
+        wanted.append("no site counts in the least size: each has share 0, or a largest size of 0 MW.")
     found = {"bounds": outside, "requirement rows": row_faults(rows, sites, rating), "objective": wanted}
     wrong = {part: problems for part, problems in found.items() if problems}
     if len(wrong) > 1:

@@ -226,6 +226,11 @@ def ac_verdict(problem: HostingProblem, found: Plan, H: Floats) -> AcVerdict:
         status = f"All {len(problem.year)} hours solve; no voltage limits were set."
     elif inside:
         status = f"All {len(problem.year)} hours solve with every voltage within its limits."
+        if screen.widened:
+            status = (
+                f"{status[:-1]}, but for {screen.widened} bus-hours that are outside with nothing hosted and "
+                "do not get worse."
+            )
     else:
         outside = int((room.min(axis=0) < -AC_TOLERANCE).sum())
         status = (

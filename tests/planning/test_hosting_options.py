@@ -246,6 +246,15 @@ def test_objectives_are_refused_with_all_faults(problem: HostingProblem) -> None
         f"  requirement rows: row 'odd' names 5, which is not a site. Did you mean '75'? {known}\n"
         f"  objective: must_open names 6, which is not a site. {known}"
     )
+    for asked in (
+        lambda: problem.solve(objective=MaxMin(dict.fromkeys(SITES, 0.0))),
+        lambda: problem.pareto(3, bounds=dict.fromkeys(SITES, (0.0, 0.0))),
+    ):
+        with pytest.raises(InputError) as error:
+            asked()
+        assert str(error.value) == (
+            "objective: no site counts in the least size: each has share 0, or a largest size of 0 MW."
+        )
     with pytest.raises(InputError) as error:
         problem.pareto(1)
     assert str(error.value) == "pareto: 1 points; a front has at least 2."

@@ -205,6 +205,34 @@ def test_a_site_that_gains_nothing_is_told_the_limits_in_its_way() -> None:
     )
 
 
+def test_voltages_that_were_held_outside_the_limits_are_told_with_the_verdict() -> None:
+    held = HostingProblem(
+        NETWORK, SITES, YEAR, 0.6, (0.95, 1.06), reactive_limits=False, base_violations="hold"
+    )
+    verdict = held.check_ac(held.solve())
+    assert held.screen is not None
+    assert verdict.passed
+    assert verdict.status.startswith(
+        f"All 24 hours solve with every voltage within its limits, but for {held.screen.widened} bus-hours "
+        "that are outside with nothing hosted and do not get worse."
+    )
+
+
+def test_a_row_without_coefficients_is_not_passed_over(problem: HostingProblem) -> None:
+    free = problem.solve()
+    assert problem.solve([Row({}, -1.0, "holds"), Row({75: 0.0}, 0.0, "holds")]).total_mw == pytest.approx(
+        free.total_mw, abs=1e-4
+    )
+    with pytest.raises(InfeasibleError) as error:
+        problem.solve([Row({75: 0.0}, 1.0, "cannot be", unit="MW")])
+    assert "Missed: cannot be (1 MW short at least)." in str(error.value)
+    unknown = Row({75: 0.0}, 1.0, "no margin known at 75", 75)
+    assert problem.solve([unknown]).closed[75] == "no margin known at 75"
+    with pytest.raises(InfeasibleError) as error:
+        problem.solve([unknown], must_open=(75,))
+    assert "Missed: no margin known at 75 (1 short at least)." in str(error.value)
+
+
 def test_a_range_without_any_of_its_sizes_is_told_as_such() -> None:
     sized = HostingProblem(NETWORK, SITES, YEAR, rating_scale=0.6, min_size=20.0, reactive_limits=False)
     closed = sized.solve(bounds={75: (0.0, 10.0)}).closed
