@@ -156,7 +156,8 @@ def side_by_side(data: MarginData, slopes: Floats | None = None) -> list[Kept]:
     methods = METHODS if slopes is not None else METHODS[:-1]
     margin = {"voltage": data.voltage, "loss": data.loss_share}
     met = np.asarray(data.ok & (data.voltage >= 0.0) & (data.loss_share >= 0.0))
-    unseen = np.asarray(~data.fit)
+    own = data.hosting[np.arange(len(data.site)), [data.sites.index(bus) for bus in data.site]]
+    unseen = np.asarray(~data.fit & (own > 0.0))  # a site that hosts nothing has nothing that could pass
     found = []
     for method in methods:
         predicted = (

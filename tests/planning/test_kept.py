@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,3 +104,14 @@ def test_nothing_held_out_is_refused() -> None:
     with pytest.raises(InputError) as error:
         side_by_side(data)
     assert str(error.value) == "surrogates side by side: no hosting vector was held out to judge them on."
+
+
+def test_a_site_that_hosts_nothing_is_no_pair() -> None:
+    """In MW its margin is 0, so that every form in MW would pass it, whatever its share."""
+    data, _ = samples(lambda H, site, beta: 0.1 if site == 1 else -0.1, kinked_slope)
+    hosting = data.hosting.copy()
+    hosting[:, 1] = 0.0
+    closed = replace(data, hosting=hosting, loss_mw=np.where(data.site == 2, 0.0, data.loss_mw))
+    for form in side_by_side(closed):
+        assert form.feasible == form.kept == 15 * 2
+        assert form.false_passes == 0
