@@ -125,8 +125,8 @@ def _hidden(row: Mapping[str, Any]) -> str:
     sites = f", closing bus {', '.join(shut)}" if shut else ""
     return (
         f"{row['mode']}, beta {row['beta']:g}: {frontier['total_mw']:.1f} MW pass the replay; the paper's "
-        f"fits allow {paper['total_mw']:.1f} MW{sites}. The {gain:.1f} MW between are an effect of the fit, "
-        "not of the system."
+        f"fits allow {paper['total_mw']:.1f} MW{sites}. The {gain:.1f} MW between are an effect of the fit "
+        "and of the box that it was sampled in, not of the system."
     )
 
 

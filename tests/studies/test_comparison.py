@@ -101,6 +101,16 @@ def test_the_page_tells_limits_mechanisms_and_unsettled_searches(folder: Path) -
     assert "Searches that ended before nothing was left to gain: gfl at β 1.5, gfm at β 1.5." in text
 
 
+def test_the_page_tells_from_which_rating_on_each_site_is_open(folder: Path) -> None:
+    findings = Findings(folder)
+    text = frontier(findings)
+    rows = [row for row in findings.comparison["rows"] if row["mode"] == "gfl"]
+    for bus in SITES:
+        betas = [row["beta"] for row in rows if row["frontier"]["by_site"][str(bus)] > 0]
+        since = f"from β = {min(betas):g}" if betas else "at none"
+        assert f"bus {bus} {since}" in text.split("GFL: ", 1)[1].split("</li>", 1)[0]
+
+
 def test_without_a_frontier_there_is_no_page(tmp_path: Path) -> None:
     assert frontier(Findings(make(tmp_path))) == ""
 

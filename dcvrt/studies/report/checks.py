@@ -117,6 +117,11 @@ def forms(findings: Findings) -> list[Safe]:
             str(form["kept"]),
             number(100.0 * form["kept"] / form["feasible"], 1) if form["feasible"] else "–",
             str(form["false_passes"]),
+            *(
+                number(form["scores"][target][score], digits)
+                for target, digits in (("voltage", 5), ("loss", 4))
+                for score in ("mae", "worst_over")
+            ),
         ]
         for form in judged
     ]
@@ -132,7 +137,11 @@ def forms(findings: Findings) -> list[Safe]:
         ),
         table(
             "What each form keeps of what is feasible",
-            ["form", "what it is", "feasible pairs", "kept", "share kept (%)", "false passes"],
+            [
+                *("form", "what it is", "feasible pairs", "kept", "share kept (%)", "false passes"),
+                *("voltage: MAE (pu)", "worst over-prediction (pu)"),
+                *("loss: MAE (share; paper: MW)", "worst over-prediction (share; paper: MW)"),
+            ],
             rows,
             words=[1],
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dcvrt.studies.comparison import buses
@@ -72,6 +72,9 @@ def frontier(findings: Findings) -> Safe:
         ]),
         paragraph("Capacity that the fits hid:" if found["hidden"] else "The fits hid no capacity."),
         *([bullets(found["hidden"])] if found["hidden"] else []),
+        paragraph("In the frontier's plans, which rest on no fit and no sampled box, sites open from these "
+                  "ratings on:"),
+        bullets(_openings(found["rows"])),
         *(
             [
                 paragraph("Limits set by bisection, on the safe side of a change of the event sequence:"),
@@ -87,6 +90,19 @@ def frontier(findings: Findings) -> Safe:
             else []
         ),
     )  # fmt: skip
+
+
+def _openings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """From which rating on the frontier has each site open, by mode."""
+    said = []
+    for mode in dict.fromkeys(row["mode"] for row in rows):
+        sizes = {row["beta"]: row["frontier"]["by_site"] for row in rows if row["mode"] == mode}
+        first = {
+            bus: next((f"from β = {beta:g}" for beta in sorted(sizes) if sizes[beta][bus] > 0), "at none")
+            for bus in next(iter(sizes.values()))
+        }
+        said.append(f"{mode_name(mode)}: " + ", ".join(f"bus {bus} {since}" for bus, since in first.items()))
+    return said
 
 
 def _cells(row: Mapping[str, Any]) -> list[object]:
