@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import POINTER, Structure, c_double, c_long, c_void_p
+from ctypes import POINTER, Structure, c_double, c_float, c_long, c_void_p
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -26,7 +26,7 @@ FLAGS = (
     "-shared",
 )
 QUIET = ("-Wno-psabi", "-w")
-DOUBLES, LONGS = POINTER(c_double), POINTER(c_long)
+DOUBLES, FLOATS, LONGS = POINTER(c_double), POINTER(c_float), POINTER(c_long)
 
 
 class GroupStruct(Structure):
@@ -36,9 +36,9 @@ class GroupStruct(Structure):
         *(
             (name, c_long)
             for name in (
-                "packs", "nx", "np", "nq", "na", "rows", "bounds", "moving", "fixed",
+                "units", "lanes", "packs", "nx", "np", "nq", "na", "rows", "bounds", "moving", "fixed",
                 "fixed_columns",
-                "ports", "v_rows", "first_port", "first_state", "reads_v", "angle",
+                "ports", "v_rows", "first_port", "first_feed", "first_state", "reads_v", "angle",
             )
         ),
         ("tolerance", c_double),
@@ -60,15 +60,14 @@ class FleetStruct(Structure):
 
     _fields_ = (
         ("groups", c_long), ("group", POINTER(POINTER(GroupStruct))),
-        *((name, c_long) for name in ("ports", "points", "states", "directions", "lanes", "feeds")),
-        ("feeding", LONGS),
+        *((name, c_long) for name in ("ports", "points", "states", "directions", "feeds")),
     )  # fmt: skip
 
 
 class NetworkStruct(Structure):
     """struct network."""
 
-    _fields_ = (("z", DOUBLES), ("dz", POINTER(DOUBLES)))
+    _fields_ = (("z", DOUBLES), ("dz", POINTER(DOUBLES)), ("near", FLOATS))
 
 
 class StretchStruct(Structure):
@@ -138,7 +137,7 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "voltages.h", "steps.h", "events.h")
+    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "products.h", "voltages.h", "steps.h", "events.h")
     files = _files(*headers, "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
@@ -149,18 +148,26 @@ def network_library() -> ctypes.CDLL:
     return dll
 
 
-_objects: WeakKeyDictionary[UnitStructure, UnitObject] = WeakKeyDictionary()
+FEW = 4
+"""Lanes of an object for that many units or fewer, where others have more: in half a register, roots and
+quotients, which bound the equations of facilities, take half the time."""
+_objects: WeakKeyDictionary[UnitStructure, dict[bool, UnitObject]] = WeakKeyDictionary()
 
 
-def unit_objects(structures: Sequence[UnitStructure]) -> list[UnitObject]:
-    """Objects of several structures; those that are not there yet are compiled side by side."""
-    new = [s for s in structures if s not in _objects]
+def unit_objects(structures: Sequence[UnitStructure], units: Sequence[int]) -> list[UnitObject]:
+    """Objects of several structures, for so many units each; new ones are compiled side by side."""
+    wanted = [(s, n <= FEW) for s, n in zip(structures, units, strict=True)]
+    new = [(s, few) for s, few in dict.fromkeys(wanted) if few not in _objects.get(s, {})]
     if new:
         found = compiler()
         flags = (*FLAGS, *native_flags(found), *QUIET)
         fixed = _files("fleet.h", "group.c", "lanes.h", "width.h")
-        texts = [{**fixed, "unit.h": text_of(structure)} for structure in new]
+        texts = [{**fixed, "unit.h": text_of(s)} for s, _ in new]
+        all_flags = [(*flags, f"-DFEW={FEW}") if few else flags for _, few in new]
         with ThreadPoolExecutor(max_workers=2) as pool:
-            paths = list(pool.map(lambda files: build(files, found, flags, ("group.c",)), texts))
-        _objects.update(zip(new, map(UnitObject, paths), strict=True))
-    return [_objects[s] for s in structures]
+            paths = list(
+                pool.map(lambda files, flags: build(files, found, flags, ("group.c",)), texts, all_flags)
+            )
+        for (structure, few), path in zip(new, paths, strict=True):
+            _objects.setdefault(structure, {})[few] = UnitObject(path)
+    return [_objects[s][few] for s, few in wanted]

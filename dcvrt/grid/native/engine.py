@@ -244,13 +244,17 @@ class Engine:
                         f"{path!r}.{did_you_mean(path, names)}"
                     )
             known = {path: value for path, value in given.items() if path in names}
-            try:
-                structure.dae.parameter_values(**known)
-            except InputError as error:
-                raise InputError(
-                    f"{self.network.name}, {period.name}: facility {facility.name} at bus {buses[0]} "
-                    f"cannot run there: {error} Way out: another dc_factor or pf, or no facility at this bus."
-                ) from None
+            allowed = self._allowed.setdefault(structure, set())
+            if tuple(known.items()) not in allowed:
+                try:
+                    structure.dae.parameter_values(**known)
+                except InputError as error:
+                    raise InputError(
+                        f"{self.network.name}, {period.name}: facility {facility.name} at bus {buses[0]} "
+                        f"cannot run there: {error} Way out: another dc_factor or pf, or no facility at "
+                        "this bus."
+                    ) from None
+                allowed.add(tuple(known.items()))
             units = [
                 Unit(
                     f"facility {facility.name}",
@@ -275,6 +279,11 @@ class Engine:
         return Structure(
             dae, "v_poi", "i", -1.0, varied=(SCALE, RATING) if RATING in dae.p_names else (SCALE,)
         )
+
+    @cached_property
+    def _allowed(self) -> WeakKeyDictionary[Structure, set[tuple[tuple[str, float], ...]]]:
+        """Values with which a facility was seen to run; the same at all operating points of a period."""
+        return WeakKeyDictionary()
 
     @cached_property
     def _structures(self) -> WeakKeyDictionary[Dae, Structure]:

@@ -249,6 +249,8 @@ class Equilibrium:
         dsetpoints : array (units, set-points, thetas)
         """
         nx = self.x.shape[1]
+        if not dv.shape[1]:
+            return np.zeros((*self.x.shape, 0)), np.zeros((len(self.x), self.jacobian.shape[2] - nx, 0))
         right = self.by_given @ self._given(dv, dvaried)
         if self.group.structure.setpoints:
             right[:, nx:] -= np.stack([di.real, di.imag], axis=1)

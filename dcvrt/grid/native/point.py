@@ -66,7 +66,9 @@ class System:
     @cached_property
     def layout(self) -> Layout:
         """Units in lanes, with their compiled equations."""
-        return Layout(self.all_groups, tuple(unit_objects([g.structure for g in self.all_groups])))
+        groups = self.all_groups
+        objects = unit_objects([g.structure for g in groups], [len(g.units) for g in groups])
+        return Layout(groups, tuple(objects))
 
     @cached_property
     def unit_bus(self) -> Integers:
@@ -79,14 +81,9 @@ class System:
         return np.unique(np.r_[self.unit_bus, self.points])
 
     @cached_property
-    def places(self) -> tuple[Integers, npt.NDArray[np.bool_], Integers]:
-        """Among `buses`: place of every port, whether it feeds a current, place of every point."""
-        unit, real = self.layout.unit_of_port()
-        return (
-            np.searchsorted(self.buses, self.unit_bus[unit]),
-            real,
-            np.searchsorted(self.buses, self.points),
-        )
+    def places(self) -> tuple[Integers, Integers]:
+        """Among `buses`: places of all units, and of all points."""
+        return np.searchsorted(self.buses, self.unit_bus), np.searchsorted(self.buses, self.points)
 
 
 class NativePoint:
@@ -308,8 +305,7 @@ class NativePoint:
             pieces.append(
                 (float(samples[0]), float(samples[-1]), network, samples, (moves or {}).get(k, still))
             )
-        unit, _ = self.system.layout.unit_of_port()
-        v_start = self.v0[self.system.unit_bus[unit]]
+        v_start = self.v0[self.system.unit_bus[self.system.layout.unit_of_port]]
         found = simulate(self.fleet, pieces, v_start, options)
         at = self.system.points
         before = np.tile(self.v0[at], (len(times[0]), 1))

@@ -109,22 +109,20 @@ class Ports:
         return z, dz
 
 
-def table(
-    z: Phasors, dz: Sequence[Phasors], port: Integers, real: npt.NDArray[np.bool_], point: Integers
-) -> NetworkTable:
+def table(z: Phasors, dz: Sequence[Phasors], units: Integers, points: Integers) -> NetworkTable:
     """Impedances as the engine reads them.
 
     Parameters
     ----------
     z, dz : between the buses of `Ports`
-    port, point : int arrays
-        Position among those buses of every port and point.
-    real : bool array
-        Ports that feed a current; those of lanes without a unit do not.
+    units, points : int arrays
+        Position among those buses of every unit and point.
     """
-    filled = np.r_[port, point, np.zeros(-len(point) % BLOCK, dtype=np.int64)]
+    filled = np.zeros(-(-len(units) // BLOCK) * BLOCK + -(-len(points) // BLOCK) * BLOCK, dtype=np.int64)
+    filled[: len(units)] = units
+    filled[-(-len(units) // BLOCK) * BLOCK :][: len(points)] = points
 
     def spread(m: Phasors) -> Phasors:
-        return np.asarray(m[np.ix_(filled, port[real])])
+        return np.asarray(m[filled[:, None], units])
 
     return NetworkTable(spread(z), [spread(d) if d.size else None for d in dz])

@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Sequence
 from ctypes import POINTER, byref, c_long, pointer
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from dcvrt.grid.native import build
 from dcvrt.grid.native.build import (
     DOUBLES,
+    FLOATS,
     LONGS,
     FleetStruct,
     GroupStruct,
@@ -27,7 +29,7 @@ from dcvrt.grid.native.fleet import Equilibrium, Group
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
-BLOCK = 8
+BLOCK, WIDE_BLOCK = 8, 16
 EVENT_ROOM = 4096
 ALIGNMENT = 64
 MOST_DIRECTIONS = 64
@@ -80,36 +82,44 @@ class Layout:
     objects: tuple[UnitObject, ...]
 
     @property
-    def lanes(self) -> int:
-        return self.objects[0].lanes if self.objects else BLOCK
+    def lanes(self) -> list[int]:
+        """Lanes of each group."""
+        return [o.lanes for o in self.objects]
 
     @property
     def packs(self) -> list[int]:
-        return [-(-len(g.units) // self.lanes) for g in self.groups]
+        return [-(-len(g.units) // o.lanes) for g, o in zip(self.groups, self.objects, strict=True)]
 
     @property
     def ports(self) -> int:
         """Ports, those of lanes without a unit included; a multiple of the rows of a block."""
-        return -(-sum(self.packs) * self.lanes // BLOCK) * BLOCK
+        return -(-sum(p * n for p, n in zip(self.packs, self.lanes, strict=True)) // BLOCK) * BLOCK
 
-    def unit_of_port(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-        """Of each port the number of its unit, through the groups, and whether it is not a repeat."""
-        unit, real, first = [], [], 0
-        for group, packs in zip(self.groups, self.packs, strict=True):
-            n = len(group.units)
-            own = np.minimum(np.arange(packs * self.lanes), n - 1)
-            unit.append(first + own)
-            real.append(np.arange(packs * self.lanes) < n)
-            first += n
-        unit_ = np.concatenate([*unit, np.zeros(0, dtype=np.int64)])
-        rest = self.ports - len(unit_)
-        return np.r_[unit_, np.full(rest, first - 1)], np.r_[np.concatenate(real), np.zeros(rest, dtype=bool)]
+    @property
+    def first_state(self) -> list[int]:
+        """Where the states of each group begin, then how many there are; at multiples of a block."""
+        sizes = [
+            -(-p * n * g.structure.dae.x.numel() // BLOCK) * BLOCK
+            for g, p, n in zip(self.groups, self.packs, self.lanes, strict=True)
+        ]
+        return [sum(sizes[:k]) for k in range(len(sizes) + 1)]
 
-    def in_lanes(self, values: Floats, packs: int) -> Floats:
-        """(units, ...) as (packs, ..., lanes)."""
-        own = np.minimum(np.arange(packs * self.lanes), len(values) - 1)
-        spread = values[own].reshape(packs, self.lanes, *values.shape[1:])
-        return np.ascontiguousarray(np.moveaxis(spread, 1, -1), dtype=float)
+    @cached_property
+    def unit_of_port(self) -> npt.NDArray[np.int64]:
+        """Of each port the number of its unit, through the groups; lanes without a unit repeat the last."""
+        unit, first = [], 0
+        for group, packs, lanes in zip(self.groups, self.packs, self.lanes, strict=True):
+            unit.append(first + np.minimum(np.arange(packs * lanes), len(group.units) - 1))
+            first += len(group.units)
+        return np.concatenate([*unit, np.full(self.ports - sum(map(len, unit)), first - 1)])
+
+
+def in_lanes(values: Floats, lanes: int) -> Floats:
+    """(units, ...) as (packs, ..., lanes); lanes without a unit repeat the last."""
+    packs = -(-len(values) // lanes)
+    own = np.minimum(np.arange(packs * lanes), len(values) - 1)
+    spread = values[own].reshape(packs, lanes, *values.shape[1:])
+    return np.ascontiguousarray(np.moveaxis(spread, 1, -1), dtype=float)
 
 
 def _aligned(array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
@@ -131,8 +141,8 @@ class NetworkTable:
 
     Parameters
     ----------
-    z : complex array (ports + points, ports that feed a current)
-        Rows of points are filled up to whole blocks.
+    z : complex array (ports that feed a current + points, ports that feed a current)
+        Rows of ports and rows of points are each filled up to whole blocks.
     dz : sequence of such arrays or None, one a parameter
     """
 
@@ -141,17 +151,21 @@ class NetworkTable:
 
     def __post_init__(self) -> None:
         self._z = _blocks(self.z)
+        feeds = self.z.shape[1]
+        rows = np.zeros((-(-feeds // WIDE_BLOCK) * WIDE_BLOCK, feeds), dtype=complex)
+        rows[:feeds] = self.z[:feeds]
+        self._near = _blocks(rows, WIDE_BLOCK, np.float32)
         self._dz = [None if d is None else _blocks(d) for d in self.dz]
         self._pointers = (DOUBLES * max(len(self._dz), 1))(
             *(DOUBLES() if d is None else _pointer(d) for d in self._dz)
         )
-        self.struct = NetworkStruct(_pointer(self._z), self._pointers)
+        self.struct = NetworkStruct(_pointer(self._z), self._pointers, self._near.ctypes.data_as(FLOATS))
 
 
-def _blocks(z: Phasors) -> Floats:
+def _blocks(z: Phasors, size: int = BLOCK, precision: type = np.float64) -> Floats:
     rows, columns = z.shape
-    blocks = z.reshape(rows // BLOCK, BLOCK, columns).transpose(0, 2, 1)
-    return _aligned(np.stack([blocks.real, blocks.imag], axis=2))  # type: ignore[return-value]
+    blocks = z.reshape(rows // size, size, columns).transpose(0, 2, 1)
+    return _aligned(np.stack([blocks.real, blocks.imag], axis=2, dtype=precision, casting="same_kind"))  # type: ignore[return-value]
 
 
 class Fleet:
@@ -169,25 +183,25 @@ class Fleet:
         self.directions = dx[0].shape[-1] if dx else 0
         self._keep: list[object] = []
         self._start: list[tuple[npt.NDArray[np.generic], npt.NDArray[np.generic]]] = []
-        d, lanes = self.directions, layout.lanes
-        rows = layout.ports + -(-points // BLOCK) * BLOCK
-        structs, x, xs, port, state = [], [], [], 0, 0
-        for group, packs, obj, eq, gx, gs in zip(
-            layout.groups, layout.packs, layout.objects, rest, dx, dset, strict=True
+        d, ports = self.directions, layout.ports
+        rows = ports + -(-points // BLOCK) * BLOCK
+        structs, port, feed = [], 0, 0
+        *begins, states = layout.first_state
+        self.x, self.xs = np.zeros(states), np.zeros(states * d)
+        for group, packs, obj, eq, gx, gs, state in zip(
+            layout.groups, layout.packs, layout.objects, rest, dx, dset, begins, strict=True
         ):
-            structs.append(self._group(group, packs, obj, eq, gs, layout.ports, rows, port, state))
-            x.append(layout.in_lanes(eq.x, packs).ravel())
-            xs.append(layout.in_lanes(gx.transpose(0, 2, 1), packs).ravel())
-            port += packs * lanes
-            state += packs * lanes * eq.x.shape[1]
-        self.x, self.xs = np.concatenate([*x, np.zeros(0)]), np.concatenate([*xs, np.zeros(0)])
+            structs.append(self._group(group, packs, obj, eq, gs))
+            structs[-1].ports, structs[-1].v_rows = ports, rows
+            structs[-1].first_port, structs[-1].first_feed, structs[-1].first_state = port, feed, state
+            x, xs = in_lanes(eq.x, obj.lanes).ravel(), in_lanes(gx.transpose(0, 2, 1), obj.lanes).ravel()
+            self.x[state : state + len(x)] = x
+            self.xs[state * d : state * d + len(xs)] = xs
+            port += packs * obj.lanes
+            feed += len(group.units)
         self._structs = structs
         self._table = (POINTER(GroupStruct) * max(len(structs), 1))(*(pointer(s) for s in structs))
-        feeding = np.flatnonzero(layout.unit_of_port()[1]).astype(c_long)
-        self.struct = FleetStruct(
-            len(structs), self._table, layout.ports, points, state, d, lanes,
-            len(feeding), self._held(feeding).ctypes.data_as(LONGS),
-        )  # fmt: skip
+        self.struct = FleetStruct(len(structs), self._table, ports, points, states, d, feed)
 
     def _held(self, array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         self._keep.append(array)
@@ -200,12 +214,8 @@ class Fleet:
         obj: UnitObject,
         eq: Equilibrium,
         dset: Floats,
-        ports: int,
-        rows: int,
-        port: int,
-        state: int,
     ) -> GroupStruct:
-        dae, d, lanes = group.structure.dae, self.directions, self.layout.lanes
+        dae, d, lanes = group.structure.dae, self.directions, obj.lanes
         automata, table = dae.automata, group.structure.rows
         flags = [np.asarray(a.flags, dtype=float).reshape(len(a.modes), -1) for a in automata]
         widths = [f.shape[1] for f in flags]
@@ -233,19 +243,20 @@ class Fleet:
         inertia = np.zeros(len(group.units))
         if structure.inertia:
             inertia = eq.p[:, structure.column(structure.inertia)]
-        mass = self.layout.in_lanes(inertia, packs)
+        mass = in_lanes(inertia, lanes)
         mass.ravel()[len(group.units) :] = 0.0
         many = packs * lanes
         struct = GroupStruct(
-            packs=packs, nx=dae.x.numel(), np=eq.p.shape[1], nq=len(start), na=len(automata), rows=len(table),
+            units=len(group.units), lanes=lanes, packs=packs, nx=dae.x.numel(), np=eq.p.shape[1],
+            nq=len(start), na=len(automata), rows=len(table),
             bounds=len(structure.bounds), moving=len(structure.moving), fixed=obj.fixed,
             fixed_columns=obj.fixed_columns,
-            ports=ports, v_rows=rows, first_port=port, first_state=state, reads_v=int(not structure.affine),
+            reads_v=int(not structure.affine),
             angle=dae.x_names.index(structure.angle) if structure.angle else -1,
             tolerance=group.tolerance,
-            p=doubles(self.layout.in_lanes(eq.p, packs)),
-            moving_seed=doubles(self.layout.in_lanes(seeds, packs)),
-            held=doubles(self.layout.in_lanes(held, packs)), inertia=doubles(mass),
+            p=doubles(in_lanes(eq.p, lanes)),
+            moving_seed=doubles(in_lanes(seeds, lanes)),
+            held=doubles(in_lanes(held, lanes)), inertia=doubles(mass),
             q=varying(np.repeat(np.tile(start, packs), lanes), DOUBLES),
             entry=varying(np.zeros(many * max(len(automata), 1)), DOUBLES),
             entries=varying(np.zeros(many * max(len(automata) * d, 1)), DOUBLES),

@@ -121,13 +121,13 @@ def run(
 
 def states(point: NativePoint, end: np.ndarray) -> list[np.ndarray]:
     """States where a run ended, (units, states) of each group."""
-    layout, found, at = point.system.layout, [], 0
-    for group, packs in zip(layout.groups, layout.packs, strict=True):
+    layout, found = point.system.layout, []
+    for group, packs, lanes, at in zip(
+        layout.groups, layout.packs, layout.lanes, layout.first_state, strict=False
+    ):
         nx = group.structure.dae.x.numel()
-        size = packs * nx * layout.lanes
-        lanes = end[at : at + size].reshape(packs, nx, layout.lanes)
-        found.append(lanes.transpose(0, 2, 1).reshape(-1, nx)[: len(group.units)])
-        at += size
+        own = end[at : at + packs * nx * lanes].reshape(packs, nx, lanes)
+        found.append(own.transpose(0, 2, 1).reshape(-1, nx)[: len(group.units)])
     return found
 
 

@@ -1,17 +1,23 @@
-"""The network as its ports see it: updates of rank one, derivatives, unsymmetric admittance, idle lanes."""
+"""The network as its ports see it: updates of low rank, derivatives, phase shifters; lanes and precision."""
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from importlib import resources
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from dcvrt.grid import BusFault, Grid
+from dcvrt.grid import BusFault, Grid, Period
+from dcvrt.grid.native import build
+from dcvrt.grid.native.engine import sample_times
 from dcvrt.grid.native.ports import Ports
+from dcvrt.grid.native.run import Options
 from dcvrt.models.machines import Tgov1
 from tests.grid.native.cases import (
+    NO_VRT,
     TIGHT,
     TIGHTEST,
     engine,
@@ -132,3 +138,35 @@ def test_machines_of_two_structures_are_those_of_one(count: int) -> None:
     _, two, _ = run(b, {}, fault, 0.6, options=TIGHT)
     assert np.abs(one.v - two.v).max() < 1e-4  # R = 1000: the governor moves by 1e-5 of the speed
     assert np.abs(one.v - one.v[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("salient", [False, True], ids=["explicit", "coupled"])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_few_units_in_narrow_packs_are_those_in_wide_ones(
+    count: int, salient: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault, asked = BusFault(100, 0.1, 0.1, x_f=0.05), ("H", "load")
+    _, narrow, few = run(star(count, 0, salient), {101: 10.0}, fault, 0.5, asked, options=TIGHTEST)
+    monkeypatch.setattr(build, "FEW", 0)
+    _, wide, many = run(star(count, 0, salient), {101: 10.0}, fault, 0.5, asked, options=TIGHTEST)
+    assert few.system.layout.lanes == [min(4, *many.system.layout.lanes)]
+    np.testing.assert_allclose(narrow.v, wide.v, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(narrow.tangents, wide.tangents, rtol=1e-6, atol=1e-9)
+
+
+# -- precision ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bus", [22, 17, 74])
+def test_single_precision_in_the_stages_stays_far_below_the_tolerance(grid: Grid, bus: int) -> None:
+    """On both sides of the tolerance from which on it is used, voltages are the same."""
+    text = (resources.files("dcvrt.grid.native") / "driver" / "pair.h").read_text(encoding="utf-8")
+    (limit,) = (float(n) for n in re.findall(r"#define NEAR_FROM (\S+)", text))
+    point, stages = grid.native.point(NO_VRT, Period()), BusFault(bus).stages(grid.network)
+    times = sample_times(stages, 1.5, 1 / 120)
+    single, double = (
+        point.simulate(stages, times, Options(rtol=r, atol=limit)) for r in (limit, 0.9999 * limit)
+    )
+    assert not single.status
+    difference = np.abs(single.v - double.v).max()
+    assert 1e-12 < difference < 0.1 * limit

@@ -19,16 +19,17 @@ static double alarm(struct run *r, double t, const struct state *x, const struct
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
         if (!(group->rows + group->bounds)) continue;
+        long lanes = group->lanes;
         for (long pack = 0; pack < group->packs; pack++) {
             const double *value = guards_of(r, group, pack, t, x, m);
             for (long row = 0; row < group->rows + group->bounds; row++)
-                for (long lane = 0; lane < f->lanes; lane++) {
-                    double guard = value[row * f->lanes + lane];
+                for (long lane = 0; lane < lanes; lane++) {
+                    double guard = value[row * lanes + lane];
                     if (row < group->rows) {
                         long a = group->row_automaton[row];
-                        if (group->mode[(pack * group->na + a) * f->lanes + lane] != group->row_source[row])
+                        if (group->mode[(pack * group->na + a) * lanes + lane] != group->row_source[row])
                             continue;
-                        if (isfinite(group->since[(pack * group->rows + row) * f->lanes + lane])) continue;
+                        if (isfinite(group->since[(pack * group->rows + row) * lanes + lane])) continue;
                     }
                     if (guard > most) most = guard;
                 }
@@ -37,26 +38,22 @@ static double alarm(struct run *r, double t, const struct state *x, const struct
     return most;
 }
 
-/* First time in the last step at which an alarm is positive; r->inside and r->here are left there. */
-static int locate(struct run *r, double *at)
+/* First time in the last step at which an alarm is positive, as a share of the step; g_high is that of its end. */
+static int locate(struct run *r, double g_high, double *at)
 {
-    double low = 0.0, high = 1.0, g_low, g_high;
+    double low = 0.0, high = 1.0, g_low = fmin(alarm(r, r->t, &r->now, &r->k[0]), 0.0);
+    long d = r->d, ns = r->ns;
+    int side = 0, bad = 0;
     if (r->coupled) memcpy(r->here.v, r->k[0].v, r->size_v * sizeof(double));
-    inside_at(r, low);
-    if (voltages(r, r->t, &r->inside, &r->here, 0, r->ports)) return 1;
-    g_low = fmin(alarm(r, r->t, &r->inside, &r->here), 0.0);
-    inside_at(r, high);
-    if (voltages(r, r->t + r->h, &r->inside, &r->here, 0, r->ports)) return 1;
-    g_high = alarm(r, r->t + r->h, &r->inside, &r->here);
-    int side = 0;
-    for (int i = 0; i < 100 && (high - low) * r->h > LOCATED; i++) {
+    r->d = r->ns = 0; /* where it lies does not ask for derivatives */
+    for (int i = 0; i < 100 && !bad && (high - low) * r->h > LOCATED; i++) {
         double middle = i % 4 == 3 || !isfinite(g_low) || g_high <= g_low
                             ? 0.5 * (low + high)
                             : (low * g_high - high * g_low) / (g_high - g_low);
         double least = 0.01 * (high - low);
         middle = fmin(fmax(middle, low + fmin(least, 0.5 * LOCATED / r->h)), high - fmin(least, 0.5 * LOCATED / r->h));
         inside_at(r, middle);
-        if (voltages(r, r->t + middle * r->h, &r->inside, &r->here, 0, r->ports)) return 1;
+        bad = voltages(r, r->t + middle * r->h, &r->inside, &r->here, AT_PORTS);
         double g = alarm(r, r->t + middle * r->h, &r->inside, &r->here);
         if (g > 0.0) {
             high = middle, g_high = g;
@@ -68,10 +65,9 @@ static int locate(struct run *r, double *at)
             side = -1;
         }
     }
-    inside_at(r, high);
-    if (voltages(r, r->t + high * r->h, &r->inside, &r->here, 0, r->ports)) return 1;
+    r->d = d, r->ns = ns;
     *at = high;
-    return 0;
+    return bad;
 }
 
 static void note(struct run *r, double t, long g, long row, long unit)
@@ -86,7 +82,7 @@ static void note(struct run *r, double t, long g, long row, long unit)
 
 static void set_mode(struct run *r, const struct group *g, long pack, long lane, long a, long mode, double t)
 {
-    long lanes = r->fleet->lanes;
+    long lanes = g->lanes;
     g->mode[(pack * g->na + a) * lanes + lane] = mode;
     g->entry[(pack * g->na + a) * lanes + lane] = t;
     for (long k = 0, at = g->flag_begin[a]; k < g->flag_width[a]; k++) {
@@ -108,7 +104,7 @@ static void along_time(const struct run *r, int on)
 /* Derivative of the time at which a guard crosses zero: -(dg/dtheta) / (dg/dt); r->here holds the moment. */
 static int crossing(struct run *r, const struct group *g, long row, long pack, long lane)
 {
-    long d = r->d, lanes = r->fleet->lanes, all = g->rows + g->bounds;
+    long d = r->d, lanes = g->lanes, all = g->rows + g->bounds;
     struct state moving = {r->now.x, r->stage.xs};
     struct network still = {r->network->z, 0};
     const struct network *network = r->network;
@@ -116,7 +112,7 @@ static int crossing(struct run *r, const struct group *g, long row, long pack, l
     memcpy(r->there.v, r->here.v, r->size_v * sizeof(double));
     along_time(r, 1);
     r->d = 1, r->network = &still;
-    int bad = voltages(r, r->t, &moving, &r->there, 0, r->ports);
+    int bad = voltages(r, r->t, &moving, &r->there, AT_PORTS);
     g->call->guards(g, pack, 1, r->t, moving.x, moving.xs, r->there.v, r->there.vs, r->guard, r->guards);
     double rate = r->guards[row * lanes + lane];
     r->d = d, r->network = network;
@@ -135,7 +131,7 @@ static void shift_by(struct run *r, const double *f, double sign, const double *
     const struct fleet *fleet = r->fleet;
     for (long g = 0; g < fleet->groups; g++) {
         const struct group *group = fleet->group[g];
-        long each = group->nx * fleet->lanes;
+        long each = group->nx * group->lanes;
         for (long pack = 0; pack < group->packs; pack++)
             for (long k = 0; k < r->d; k++) {
                 double *s = r->now.xs + group->first_state * r->d + (pack * r->d + k) * each;
@@ -150,14 +146,14 @@ static void shift_by(struct run *r, const double *f, double sign, const double *
 static int jump(struct run *r, long g, long row, long pack, long lane)
 {
     const struct group *group = r->fleet->group[g];
-    long lanes = r->fleet->lanes, a = group->row_automaton[row], d = r->d;
+    long lanes = group->lanes, a = group->row_automaton[row], d = r->d;
     if (d) {
         if (rates(r, r->t, &r->now, &r->here)) return NO_VOLTAGE;
         if (!r->dt_known && crossing(r, group, row, pack, lane)) return NO_VOLTAGE;
         shift_by(r, r->here.f, 1.0, r->dt);
     }
     if (group->row_resets[row]) {
-        if (voltages(r, r->t, &r->now, &r->here, 0, r->ports)) return NO_VOLTAGE;
+        if (voltages(r, r->t, &r->now, &r->here, AT_PORTS)) return NO_VOLTAGE;
         group->call->reset(group, row, pack, (int)lane, d, r->t, r->now.x, r->now.xs, r->here.v, r->here.vs);
     }
     set_mode(r, group, pack, lane, a, group->row_target[row], r->t);
@@ -176,7 +172,7 @@ static double next_timer(const struct run *r)
     double next = INFINITY;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
-        long count = group->packs * group->rows * f->lanes;
+        long count = group->packs * group->rows * group->lanes;
         for (long k = 0; k < count; k++) {
             double due = group->since[k] + group->held[k];
             if (due < next) next = due;
@@ -192,35 +188,36 @@ static int settle(struct run *r)
     const struct fleet *f = r->fleet;
     for (int jumps = 0;; jumps++) {
         int fired = 0;
-        if (voltages(r, r->t, &r->now, &r->here, 0, r->ports)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
+        if (voltages(r, r->t, &r->now, &r->here, AT_PORTS)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
         for (long g = 0; g < f->groups && !fired; g++) {
             const struct group *group = f->group[g];
             if (!(group->rows + group->bounds)) continue;
+            long lanes = group->lanes;
             for (long pack = 0; pack < group->packs && !fired; pack++) {
                 const double *value = guards_of(r, group, pack, r->t, &r->now, &r->here);
                 for (long row = group->rows; row < group->rows + group->bounds; row++)
-                    for (long lane = 0; lane < f->lanes; lane++)
-                        if (value[row * f->lanes + lane] > 0.0)
-                            return failed(r, LEFT_BOUNDS, r->t, g, pack * f->lanes + lane, row - group->rows, 0);
+                    for (long lane = 0; lane < lanes; lane++)
+                        if (value[row * lanes + lane] > 0.0)
+                            return failed(r, LEFT_BOUNDS, r->t, g, pack * lanes + lane, row - group->rows, 0);
                 for (long row = 0; row < group->rows && !fired; row++)
-                    for (long lane = 0; lane < f->lanes && !fired; lane++) {
+                    for (long lane = 0; lane < lanes && !fired; lane++) {
                         long a = group->row_automaton[row];
-                        if (group->mode[(pack * group->na + a) * f->lanes + lane] != group->row_source[row])
+                        if (group->mode[(pack * group->na + a) * lanes + lane] != group->row_source[row])
                             continue;
-                        double *since = &group->since[(pack * group->rows + row) * f->lanes + lane];
-                        double held = group->held[(pack * group->rows + row) * f->lanes + lane];
+                        double *since = &group->since[(pack * group->rows + row) * lanes + lane];
+                        double held = group->held[(pack * group->rows + row) * lanes + lane];
                         int was = isfinite(*since);
-                        if (value[row * f->lanes + lane] <= 0.0 && !(was && r->t >= *since + held - SAME_INSTANT)) {
+                        if (value[row * lanes + lane] <= 0.0 && !(was && r->t >= *since + held - SAME_INSTANT)) {
                             *since = INFINITY;
                             continue;
                         }
-                        long at = (pack * r->d * group->rows + row) * f->lanes + lane, step = group->rows * f->lanes;
+                        long at = (pack * r->d * group->rows + row) * lanes + lane, step = group->rows * lanes;
                         if (!was && held > 0.0) {
                             *since = r->t;
                             if (r->d) {
                                 if (!r->dt_known && (rates(r, r->t, &r->now, &r->here) ||
                                                      crossing(r, group, row, pack, lane)))
-                                    return failed(r, NO_VOLTAGE, r->t, g, pack * f->lanes + lane, row, 0);
+                                    return failed(r, NO_VOLTAGE, r->t, g, pack * lanes + lane, row, 0);
                                 for (long k = 0; k < r->d; k++) group->sinces[at + k * step] = r->dt[k];
                                 value = guards_of(r, group, pack, r->t, &r->now, &r->here);
                             }
@@ -231,10 +228,10 @@ static int settle(struct run *r)
                             r->dt_known = 1;
                         }
                         if (jumps >= MAX_JUMPS_AT_ONCE)
-                            return failed(r, CHATTER, r->t, g, pack * f->lanes + lane, row, 0);
+                            return failed(r, CHATTER, r->t, g, pack * lanes + lane, row, 0);
                         int status = jump(r, g, row, pack, lane);
-                        if (status) return failed(r, status, r->t, g, pack * f->lanes + lane, row, 0);
-                        note(r, r->t, g, row, pack * f->lanes + lane);
+                        if (status) return failed(r, status, r->t, g, pack * lanes + lane, row, 0);
+                        note(r, r->t, g, row, pack * lanes + lane);
                         fired = 1;
                     }
             }
@@ -253,14 +250,14 @@ static void lapses(struct run *r, double t, const struct state *x, const struct 
     if (!isfinite(r->timer)) return;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
-        long count = group->packs * group->rows * f->lanes;
+        long count = group->packs * group->rows * group->lanes;
         int running = 0;
         for (long k = 0; k < count; k++) running |= isfinite(group->since[k]);
         if (!running) continue;
         for (long pack = 0; pack < group->packs; pack++) {
             const double *value = guards_of(r, group, pack, t, x, m);
-            for (long k = 0; k < group->rows * f->lanes; k++) {
-                double *since = &group->since[pack * group->rows * f->lanes + k];
+            for (long k = 0; k < group->rows * group->lanes; k++) {
+                double *since = &group->since[pack * group->rows * group->lanes + k];
                 if (isfinite(*since) && value[k] <= 0.0) *since = INFINITY;
             }
         }
@@ -277,14 +274,15 @@ static long out_of_step(const struct run *r, long *in_group, double *away)
         for (long g = 0; g < f->groups; g++) {
             const struct group *group = f->group[g];
             if (group->angle < 0) continue;
+            long lanes = group->lanes;
             for (long pack = 0; pack < group->packs; pack++)
-                for (long lane = 0; lane < f->lanes; lane++) {
-                    double m = group->inertia[pack * f->lanes + lane];
-                    double angle = r->now.x[group->first_state + (pack * group->nx + group->angle) * f->lanes + lane];
+                for (long lane = 0; lane < lanes; lane++) {
+                    double m = group->inertia[pack * lanes + lane];
+                    double angle = r->now.x[group->first_state + (pack * group->nx + group->angle) * lanes + lane];
                     if (!pass) sum += m * angle, weight += m;
                     else if (m > 0 && fabs(angle - sum / weight) > r->options->out_of_step) {
                         *in_group = g, *away = angle - sum / weight;
-                        return pack * f->lanes + lane;
+                        return pack * lanes + lane;
                     }
                 }
         }

@@ -9,7 +9,7 @@
  *
  * States of a group: [pack][state][lane]; derivatives by theta: [pack][direction][state][lane]. Voltages and
  * currents: real parts of all ports, then imaginary parts; their derivatives one direction after another.
- * Lanes without a unit repeat the last unit and feed nothing.
+ * Lanes without a unit repeat the last unit and feed nothing. A group has as many lanes as its object is made for.
  */
 #ifndef DCVRT_FLEET_H
 #define DCVRT_FLEET_H
@@ -55,9 +55,9 @@ struct functions {
 };
 
 struct group {
-    long packs, nx, np, nq, na, rows, bounds, moving, fixed, fixed_columns;
+    long units, lanes, packs, nx, np, nq, na, rows, bounds, moving, fixed, fixed_columns;
     long ports, v_rows; /* numbers of real parts in currents and in voltages of the whole fleet */
-    long first_port, first_state;
+    long first_port, first_feed, first_state; /* states of a group begin at a multiple of BLOCK */
     long reads_v;    /* whether the source depends on the unit's own voltage */
     long angle;      /* state that is a rotor angle, or -1 */
     double tolerance;          /* of its states, over that of the options */
@@ -79,16 +79,16 @@ struct group {
 struct fleet {
     long groups;
     struct group *const *group;
-    long ports, points, states, directions, lanes;
-    long feeds;          /* ports that feed a current: those of lanes with a unit */
-    const long *feeding; /* [feed] port */
+    long ports, points, states, directions;
+    long feeds;          /* ports that feed a current: those of lanes with a unit, group after group */
 };
 
-/* One network: Z from the ports that feed a current to ports and points, and its derivatives. Blocks of eight
- * rows: [block][feed][re, im][8]. */
+/* One network: Z from the ports that feed a current to those ports, then to points, and its derivatives. Blocks of
+ * eight rows: [block][feed][re, im][8]; rows of ports and rows of points are each filled up to whole blocks. */
 struct network {
     const double *z;
     const double *const *dz; /* one for each direction, or null where Z does not depend on it */
+    const float *near;       /* rows of ports, blocks of sixteen: for voltages that lie near known ones */
 };
 
 /* A stretch without a change of the network. */

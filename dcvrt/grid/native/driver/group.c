@@ -1,5 +1,9 @@
 /* The units of one structure: their generated equations, pack after pack. */
 #include "width.h"
+#if defined(FEW) && LANES > FEW
+#undef LANES
+#define LANES FEW
+#endif
 #define NW 1
 #include "lanes.h"
 #include "fleet.h"

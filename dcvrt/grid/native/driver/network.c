@@ -5,7 +5,7 @@
 
 static int sample(struct run *r, double t, const struct state *x, struct moment *m)
 {
-    if (voltages(r, t, x, m, r->ports, r->rows)) return 1;
+    if (voltages(r, t, x, m, AT_POINTS)) return 1;
     struct record *record = r->record;
     long points = r->points, stride = 2 * r->rows, k = record->n_samples++;
     for (int part = 0; part < 2; part++) {
@@ -23,6 +23,7 @@ static int stretch_run(struct run *r, const struct stretch *s)
     long next_sample = 0;
     r->network = s->network;
     r->factored = 0;
+    r->near = !r->d && !r->coupled && r->options->rtol >= NEAR_FROM;
     r->t = s->from;
     r->dt_known = 1;
     for (long k = 0; k < r->d; k++) r->dt[k] = s->dfrom ? s->dfrom[k] : 0.0;
@@ -58,8 +59,9 @@ static int stretch_run(struct run *r, const struct stretch *s)
         double next_h = (cut ? fmax(free_step, r->h) : r->h) * fmin(5.0, fmax(0.2, grow));
         next_h = fmin(next_h, REACH / fastest(r));
         double end = 1.0;
-        int event = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]) > 0.0;
-        if (event && locate(r, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
+        double at_end = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]);
+        int event = at_end > 0.0;
+        if (event && locate(r, at_end, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
         double until = end == 1.0 ? (cut ? limit : r->t + r->h) : r->t + end * r->h;
         for (; next_sample < s->samples && s->sample[next_sample] < until - SAME_INSTANT; next_sample++) {
             inside_at(r, (s->sample[next_sample] - r->t) / r->h);
@@ -117,7 +119,8 @@ static long count_memory(const struct run *r, long guards, long sensitive)
     long vectors = 4 * (r->n + r->ns) + (STAGES + 2) * (r->n + r->ns + (1 + r->d) * (2 * r->ports + r->size_v));
     long n = 2 * r->coupled;
     return vectors + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
-           4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * 128; /* each vector begins on its own cache line */
+           4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * r->fed_rows + r->fleet->feeds + r->fed_rows + WIDE_BLOCK +
+           8 * 128; /* each vector begins on its own cache line */
 }
 
 int fleet_run(const struct fleet *f, const struct options *o, long stretches, const struct stretch *s, double *x,
@@ -127,11 +130,12 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     r.n = f->states, r.d = f->directions, r.ns = r.n * r.d, r.ports = f->ports, r.points = f->points;
     r.rows = f->ports + ((f->points + BLOCK - 1) / BLOCK) * BLOCK;
     r.size_v = 2 * r.rows;
+    r.fed_rows = (f->feeds + BLOCK - 1) / BLOCK * BLOCK;
     long guards = 0;
     for (long g = 0; g < f->groups; g++) {
-        long all = (f->group[g]->rows + f->group[g]->bounds) * f->lanes;
+        long all = (f->group[g]->rows + f->group[g]->bounds) * f->group[g]->lanes;
         guards = all > guards ? all : guards;
-        if (f->group[g]->reads_v) r.coupled += f->group[g]->packs * f->lanes;
+        if (f->group[g]->reads_v) r.coupled += f->group[g]->packs * f->group[g]->lanes;
     }
     long sensitive = r.d > 0 ? r.d : 1;
     long total = count_memory(&r, guards + 8, sensitive);
@@ -139,16 +143,18 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     memset(r.memory, 0, total * sizeof(double));
     r.pivot = malloc((2 * r.coupled + 1) * sizeof(long));
     r.coupled_port = malloc((r.coupled + 1) * sizeof(long));
-    r.feed_of_port = malloc((r.ports + 1) * sizeof(long));
-    if (!r.pivot || !r.coupled_port || !r.feed_of_port) {
-        free(r.memory), free(r.pivot), free(r.coupled_port), free(r.feed_of_port);
+    r.coupled_feed = malloc((r.coupled + 1) * sizeof(long));
+    if (!r.pivot || !r.coupled_port || !r.coupled_feed) {
+        free(r.memory), free(r.pivot), free(r.coupled_port), free(r.coupled_feed);
         return NO_MEMORY;
     }
-    for (long g = 0, k = 0; g < f->groups; g++)
-        for (long i = 0; f->group[g]->reads_v && i < f->group[g]->packs * f->lanes; i++)
-            r.coupled_port[k++] = f->group[g]->first_port + i;
-    for (long p = 0; p < r.ports; p++) r.feed_of_port[p] = -1;
-    for (long j = 0; j < f->feeds; j++) r.feed_of_port[f->feeding[j]] = j;
+    for (long g = 0, k = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        for (long i = 0; group->reads_v && i < group->packs * group->lanes; i++, k++) {
+            r.coupled_port[k] = group->first_port + i;
+            r.coupled_feed[k] = group->first_feed + (i < group->units ? i : group->units - 1);
+        }
+    }
     double *at = r.memory;
     struct state *states[] = {&r.now, &r.next, &r.stage, &r.inside};
     for (int k = 0; k < 4; k++) states[k]->x = take(&at, r.n), states[k]->xs = take(&at, r.d ? r.ns : 0);
@@ -161,6 +167,8 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     r.by_v = take(&at, 4 * r.coupled), r.matrix = take(&at, 4 * r.coupled * r.coupled);
     r.right = take(&at, 2 * r.coupled), r.trial = take(&at, r.size_v), r.pack = take(&at, 4 * r.ports);
     r.scale = take(&at, r.d), r.fed = take(&at, 8 * f->feeds);
+    r.at_feeds = take(&at, 8 * r.fed_rows);
+    r.fed_change = (float *)take(&at, f->feeds), r.change = (float *)take(&at, r.fed_rows + WIDE_BLOCK);
     memcpy(r.now.x, x, r.n * sizeof(double));
     if (r.d) memcpy(r.now.xs, xs, r.ns * sizeof(double));
     for (long p = 0; p < r.ports; p++) {
@@ -189,6 +197,6 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     }
     memcpy(x, r.now.x, r.n * sizeof(double));
     if (r.d) memcpy(xs, r.now.xs, r.ns * sizeof(double));
-    free(r.memory), free(r.pivot), free(r.coupled_port), free(r.feed_of_port);
+    free(r.memory), free(r.pivot), free(r.coupled_port), free(r.coupled_feed);
     return status;
 }

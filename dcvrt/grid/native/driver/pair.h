@@ -8,6 +8,10 @@
  * Where limits of facilities are smoothed over less than a step, their corner may lie between the stages, and a step
  * or a sample inside it errs by a multiple of the estimate. The last term of the dense output sees it: what it is
  * above SMOOTH tolerance^(-1/5) tolerances counts as error, as in the kernel of single facilities.
+ *
+ * Voltages of the stages lie near those at the begin of the step: what they differ by is a product in single precision,
+ * whose rounding is 1e-7 of the difference. From a tolerance of NEAR_FROM on, that is far below it. The voltages with
+ * which the next step begins are always in double precision, so that rounding does not add up.
  */
 #ifndef DCVRT_PAIR_H
 #define DCVRT_PAIR_H
@@ -17,5 +21,6 @@
 #define REACH 5.3
 #define STILL 0.03
 #define SMOOTH 24.0
+#define NEAR_FROM 5e-7
 
 #endif

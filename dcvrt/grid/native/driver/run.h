@@ -9,9 +9,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { BLOCK = 8, MOST_DIRECTIONS = 64 };
+enum { BLOCK = 8, WIDE_BLOCK = 16, MOST_DIRECTIONS = 64 };
 
 typedef double block __attribute__((vector_size(8 * BLOCK), aligned(8)));
+typedef float wide_block __attribute__((vector_size(4 * WIDE_BLOCK), aligned(4)));
 
 struct state {
     double *x, *xs;
@@ -27,18 +28,21 @@ struct run {
     const struct options *options;
     const struct network *network;
     struct record *record;
-    long n, ns, ports, points, rows, d; /* states, their derivatives, ports, points, rows of Z, directions */
-    long size_v;                        /* numbers of one set of voltages: 2 (ports + points) */
+    long n, ns, ports, points, rows, d; /* states, their derivatives, ports, points, both in blocks, directions */
+    long size_v;                        /* numbers of one set of voltages: 2 rows */
+    long fed_rows;                      /* rows of Z of the ports that feed, in whole blocks */
+    int near;                           /* whether voltages of stages are found near those of the step's begin */
     double t, h, error_before;
     double timer;            /* when the next timer runs out */
     struct state now, next, stage, inside;
     struct moment k[STAGES], here, there;
     double *guard, *guards;  /* of one pack */
     double *by_v, *matrix, *right, *trial, *pack;
-    double *fed;             /* [feed][direction][re, im]: source currents as a product takes them */
+    double *fed;             /* [re, im][feed] of each set: source currents as a product takes them */
+    double *at_feeds;        /* [direction][re, im][row]: what a product gives for the ports that feed */
+    float *fed_change, *change; /* the same of changes, in single precision */
     long *pivot, coupled;    /* ports whose source reads their voltage */
-    long *coupled_port;
-    long *feed_of_port;      /* number among the ports that feed, or -1 */
+    long *coupled_port, *coupled_feed; /* and whose row of Z is that of its voltage */
     int factored;
     double *scale;           /* of the derivatives, per direction */
     double dt[MOST_DIRECTIONS]; /* derivative of the present instant, where known */

@@ -28,6 +28,10 @@ static int stage(struct run *r, int s)
     case 5: combine(r->n, r->now.x, r->h, 5, k, into->x); combine(r->ns, r->now.xs, r->h, 5, ks, into->xs); break;
     default: combine(r->n, r->now.x, r->h, 6, k, into->x); combine(r->ns, r->now.xs, r->h, 6, ks, into->xs);
     }
+    if (r->near && s < STAGES - 1) {
+        rates_near(r, r->t + NODE[s] * r->h, into, &r->k[0], &r->k[s]);
+        return 0;
+    }
     if (r->coupled) memcpy(r->k[s].v, r->k[s - 1].v, r->size_v * sizeof(double));
     return rates(r, r->t + NODE[s] * r->h, into, &r->k[s]);
 }
@@ -75,7 +79,7 @@ static double error_of(struct run *r)
     double worst = 0.0;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
-        long from = group->first_state, to = from + group->packs * group->nx * f->lanes;
+        long from = group->first_state, to = from + group->packs * group->nx * group->lanes;
         double over = error_in(r, from, to) / group->tolerance;
         if (!(over <= worst)) worst = over;
         if (isnan(worst)) return INFINITY;
@@ -86,7 +90,7 @@ static double error_of(struct run *r)
             for (long k = 0; k < r->d; k++) r->scale[k] = 0.0;
         for (long g = 0; g < f->groups; g++) {
             const struct group *group = f->group[g];
-            long each = group->nx * f->lanes, at = group->first_state * r->d;
+            long each = group->nx * group->lanes, at = group->first_state * r->d;
             for (long pack = 0; pack < group->packs; pack++)
                 for (long k = 0; k < r->d; k++, at += each)
                     for (long i = at; i < at + each; i++) {
@@ -107,27 +111,35 @@ static double error_of(struct run *r)
 }
 
 /* Largest rate at which a unit moves back to where it is drawn, from the last two stages of a step: both are at its
- * end, so that their states differ by what the fastest motion makes of them. */
+ * end, so that their states differ by what the fastest motion makes of them. Of the rates only what points back along
+ * that difference counts: a slow state that differs drives faster ones, which says nothing of how fast they decay. */
 static double fastest(const struct run *r)
 {
     const struct fleet *f = r->fleet;
+    const double *rate = r->k[STAGES - 1].f, *rate_before = r->k[STAGES - 2].f;
+    const double *x = r->next.x, *x_before = r->stage.x;
     double most = 0.0, still = STILL * r->options->atol;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
-        for (long pack = 0; pack < group->packs; pack++) {
-            double rate[BLOCK] = {0}, state[BLOCK] = {0};
-            long at = group->first_state + pack * group->nx * f->lanes;
-            for (long i = 0; i < group->nx; i++, at += f->lanes)
-                for (long l = 0; l < f->lanes; l++) {
-                    double df = r->k[STAGES - 1].f[at + l] - r->k[STAGES - 2].f[at + l];
-                    double dx = r->next.x[at + l] - r->stage.x[at + l];
-                    rate[l] += df * df, state[l] += dx * dx;
-                }
-            for (long l = 0; l < f->lanes; l++)
-                if (state[l] > still * still && rate[l] > most * state[l]) most = rate[l] / state[l];
+        long lanes = group->lanes, each = group->nx * lanes, at = group->first_state;
+        for (long pack = 0; pack < group->packs; pack++, at += each) {
+            block back = {0}, size = {0}; /* as many states as a block holds at once */
+            long i = 0;
+            for (; i + BLOCK <= each; i += BLOCK) {
+                block dx = *(const block *)(x + at + i) - *(const block *)(x_before + at + i);
+                back += dx * (*(const block *)(rate_before + at + i) - *(const block *)(rate + at + i));
+                size += dx * dx;
+            }
+            for (; i < each; i++) {
+                double dx = x[at + i] - x_before[at + i];
+                back[i % lanes] += dx * (rate_before[at + i] - rate[at + i]), size[i % lanes] += dx * dx;
+            }
+            for (long l = lanes; l < BLOCK; l++) back[l % lanes] += back[l], size[l % lanes] += size[l];
+            for (long l = 0; l < lanes; l++)
+                if (size[l] > still * still && back[l] > most * size[l]) most = back[l] / size[l];
         }
     }
-    return sqrt(most);
+    return most;
 }
 
 /* Weights of the stages at a share s of the step: the cubic of Hermite and the last term. */

@@ -2,70 +2,14 @@
 #ifndef DCVRT_VOLTAGES_H
 #define DCVRT_VOLTAGES_H
 
-#include "run.h"
+#include "products.h"
 
 enum { NEWTON = 30 };
+
 #define NEWTON_TOLERANCE 1e-11
 #define SLOW 0.1
 
 /* -- linear algebra -------------------------------------------------------------------------------------- */
-
-/* Rows [from, to) of Z times `count` columns of `fed`, `wide` blocks of rows at a time: a sum waits for the one
- * before it, so that several must be under way. */
-static inline __attribute__((always_inline)) long product(const struct run *r, const double *z, int count, int wide,
-                                                          double *v, long stride_v, long from, long to, int add)
-{
-    long feeds = r->fleet->feeds, each = feeds * 2 * BLOCK;
-    long row = from;
-    for (; row + wide * BLOCK <= to; row += wide * BLOCK) {
-        const double *at = z + (row / BLOCK) * each, *fed = r->fed;
-        block re[12], im[12];
-        for (int k = 0; k < wide * count; k++) re[k] = im[k] = (block){0};
-        for (long j = 0; j < feeds; j++, at += 2 * BLOCK, fed += 2 * count)
-            for (int w = 0; w < wide; w++) {
-                block zr = *(const block *)(at + w * each), zi = *(const block *)(at + w * each + BLOCK);
-                for (int k = 0; k < count; k++) {
-                    int e = w * count + k;
-                    re[e] += zr * fed[2 * k], im[e] += zr * fed[2 * k + 1];
-                    re[e] -= zi * fed[2 * k + 1], im[e] += zi * fed[2 * k];
-                }
-            }
-        for (int w = 0; w < wide; w++)
-            for (int k = 0; k < count; k++) {
-                double *vr = v + k * stride_v + row + w * BLOCK;
-                block *real = (block *)vr, *imaginary = (block *)(vr + r->rows);
-                int e = w * count + k;
-                if (add) *real += re[e], *imaginary += im[e];
-                else *real = re[e], *imaginary = im[e];
-            }
-    }
-    return row;
-}
-
-/* Rows [from, to) of Z times several sets of source currents; from and to are multiples of BLOCK. */
-static void products(struct run *r, const double *z, long count, const double *s, long stride_s, double *v,
-                     long stride_v, long from, long to, int add)
-{
-    const struct fleet *f = r->fleet;
-    for (long now; count > 0; count -= now, s += now * stride_s, v += now * stride_v) {
-        now = count < 4 ? count : 4;
-        for (long j = 0; j < f->feeds; j++)
-            for (long k = 0; k < now; k++) {
-                r->fed[2 * (j * now + k)] = s[k * stride_s + f->feeding[j]];
-                r->fed[2 * (j * now + k) + 1] = s[k * stride_s + r->ports + f->feeding[j]];
-            }
-        long row = from;
-        switch (now) {
-        case 1:
-            row = product(r, z, 1, 3, v, stride_v, row, to, add);
-            product(r, z, 1, 1, v, stride_v, row, to, add);
-            break;
-        case 2: product(r, z, 2, 1, v, stride_v, row, to, add); break;
-        case 3: product(r, z, 3, 1, v, stride_v, row, to, add); break;
-        default: product(r, z, 4, 1, v, stride_v, row, to, add);
-        }
-    }
-}
 
 /* LU factors with row pivots, in place; 0 where the matrix is singular. */
 static int factorise(double *a, long n, long *pivot)
@@ -108,11 +52,11 @@ static void back(const double *a, long n, const long *pivot, double *b)
 
 /* -- the network ----------------------------------------------------------------------------------------- */
 
-/* Re or im of Z from a port to a row; ports without a unit feed nothing. */
-static double z_entry(const struct run *r, long row, long port, int part)
+/* Re or im of Z between two coupled ports; those without a unit feed nothing. */
+static double z_entry(const struct run *r, long to, long from, int part)
 {
-    long feed = r->feed_of_port[port];
-    if (feed < 0) return 0.0;
+    long row = r->coupled_feed[to], feed = r->coupled_feed[from];
+    if (from > 0 && r->coupled_feed[from - 1] == feed) return 0.0;
     return r->network->z[((row / BLOCK) * r->fleet->feeds + feed) * 2 * BLOCK + part * BLOCK + row % BLOCK];
 }
 
@@ -126,8 +70,8 @@ static void slopes(struct run *r, double t, const double *x, const double *v)
         if (!group->reads_v) continue;
         group->call->source_by_v(group, t, x, v, pack);
         for (long i = 0; i < group->packs; i++)
-            for (long lane = 0; lane < f->lanes; lane++, k++)
-                for (int e = 0; e < 4; e++) r->by_v[4 * k + e] = pack[(i * 4 + e) * f->lanes + lane];
+            for (long lane = 0; lane < group->lanes; lane++, k++)
+                for (int e = 0; e < 4; e++) r->by_v[4 * k + e] = pack[(i * 4 + e) * group->lanes + lane];
     }
 }
 
@@ -137,8 +81,8 @@ static int factorise_ports(struct run *r)
     long c = r->coupled, n = 2 * c;
     for (long i = 0; i < c; i++)
         for (long j = 0; j < c; j++) {
-            double zr = z_entry(r, r->coupled_port[i], r->coupled_port[j], 0);
-            double zi = z_entry(r, r->coupled_port[i], r->coupled_port[j], 1);
+            double zr = z_entry(r, i, j, 0);
+            double zi = z_entry(r, i, j, 1);
             const double *by = r->by_v + 4 * j;
             for (int q = 0; q < 2; q++) {
                 double a = by[2 * q], b = by[2 * q + 1];
@@ -158,9 +102,9 @@ static void sources(struct run *r, long directions, double t, const struct state
             f->group[g]->call->source(f->group[g], directions, t, x->x, x->xs, m->v, m->vs, m->s, m->ss);
 }
 
-/* Voltages at rows [0, rows) of Z from the states, with their derivatives; m->v holds a guess of the voltages
+/* Voltages at ports or points or both from the states, with their derivatives; m->v holds a guess of the voltages
  * of coupled ports. Nonzero where there are none. */
-static int voltages(struct run *r, double t, const struct state *x, struct moment *m, long from, long rows)
+static int voltages(struct run *r, double t, const struct state *x, struct moment *m, int rows)
 {
     long n = r->coupled, stride = 2 * r->rows, ports = 2 * r->ports, d = r->d;
     const double *z = r->network->z;
@@ -171,7 +115,7 @@ static int voltages(struct run *r, double t, const struct state *x, struct momen
         for (;; iteration++) {
             if (iteration == NEWTON) return 1;
             double *new = r->trial, worst = 0.0;
-            products(r, z, 1, m->s, ports, new, stride, 0, r->ports, 0);
+            products(r, z, 1, m->s, ports, new, stride, AT_PORTS, 0);
             for (long k = 0; k < n; k++) {
                 long p = r->coupled_port[k];
                 r->right[k] = new[p] - m->v[p];
@@ -200,17 +144,18 @@ static int voltages(struct run *r, double t, const struct state *x, struct momen
     }
     if (!d) {
         if (!n) sources(r, 0, t, x, m, 0);
-        products(r, z, 1, m->s, ports, m->v, stride, from, rows, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, rows, 0);
         return 0;
     }
     if (n) {
         memset(m->vs, 0, d * stride * sizeof(double));
+        rows |= AT_PORTS;
         sources(r, d, t, x, m, 0);
-        products(r, z, 1, m->s, ports, m->v, stride, 0, rows, 0);
-        products(r, z, d, m->ss, ports, m->vs, stride, 0, r->ports, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, rows, 0);
+        products(r, z, d, m->ss, ports, m->vs, stride, AT_PORTS, 0);
         for (long k = 0; k < d; k++) {
             if (r->network->dz && r->network->dz[k])
-                products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, 0, r->ports, 1);
+                products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, AT_PORTS, 1);
             for (long c = 0; c < n; c++) {
                 r->right[c] = m->vs[k * stride + r->coupled_port[c]];
                 r->right[n + c] = m->vs[k * stride + r->rows + r->coupled_port[c]];
@@ -222,25 +167,37 @@ static int voltages(struct run *r, double t, const struct state *x, struct momen
             }
         }
         sources(r, d, t, x, m, 1);
-        from = 0;
     } else {
         sources(r, d, t, x, m, 0);
-        products(r, z, 1, m->s, ports, m->v, stride, from, rows, 0);
+        products(r, z, 1, m->s, ports, m->v, stride, rows, 0);
     }
-    products(r, z, d, m->ss, ports, m->vs, stride, from, rows, 0);
+    products(r, z, d, m->ss, ports, m->vs, stride, rows, 0);
     for (long k = 0; k < d; k++)
         if (r->network->dz && r->network->dz[k])
-            products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, from, rows, 1);
+            products(r, r->network->dz[k], 1, m->s, ports, m->vs + k * stride, stride, rows, 1);
     return 0;
+}
+
+static void flows(struct run *r, double t, const struct state *x, struct moment *m)
+{
+    const struct fleet *f = r->fleet;
+    for (long g = 0; g < f->groups; g++)
+        f->group[g]->call->flow(f->group[g], r->d, t, x->x, x->xs, m->v, m->vs, m->f, m->fs);
 }
 
 static int rates(struct run *r, double t, const struct state *x, struct moment *m)
 {
-    if (voltages(r, t, x, m, 0, r->ports)) return 1;
-    const struct fleet *f = r->fleet;
-    for (long g = 0; g < f->groups; g++)
-        f->group[g]->call->flow(f->group[g], r->d, t, x->x, x->xs, m->v, m->vs, m->f, m->fs);
+    if (voltages(r, t, x, m, AT_PORTS)) return 1;
+    flows(r, t, x, m);
     return 0;
+}
+
+/* Rates at a moment near one whose voltages are known. */
+static void rates_near(struct run *r, double t, const struct state *x, const struct moment *known, struct moment *m)
+{
+    sources(r, 0, t, x, m, 0);
+    products_near(r, known, m);
+    flows(r, t, x, m);
 }
 
 #endif
