@@ -15,6 +15,7 @@ import typer
 
 from dcvrt import __version__, envelopes, scenarios
 from dcvrt.errors import DcvrtError, InfeasibleError, InputError, SimulationError, raise_all
+from dcvrt.threads import one_thread
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -432,6 +433,7 @@ def code_of(error: DcvrtError) -> int:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of dcvrt are one message without a traceback."""
+    one_thread()  # before anything heavy is imported
     try:
         app(sys.argv[1:] if arguments is None else arguments)
     except DcvrtError as error:

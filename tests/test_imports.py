@@ -22,6 +22,7 @@ PLANNING = GRID | CRITERIA | MODELS | {"facility", "planning"}
 ALLOWED = {
     "errors": BASE,
     "cache": BASE,
+    "threads": {"threads"},
     "units": BASE,
     "dae": BASE | {"linear"},  # Dae.linearise, and the types of points
     "linear": BASE | {"dae"},
@@ -41,8 +42,8 @@ ALLOWED = {
     "fmi": {"errors", "units", "dae", "integrators", "fmi"},  # of the integrators the compiler chain only
     "grid": GRID | MODELS,  # machines are blocks
     "planning": PLANNING,
-    "studies": PLANNING | {"studies", "scenarios", "envelopes"},
-    "cli": PLANNING | {"fmi", "studies", "cli", "scenarios", "envelopes"},
+    "studies": PLANNING | {"studies", "scenarios", "envelopes", "threads"},
+    "cli": PLANNING | {"fmi", "studies", "cli", "scenarios", "envelopes", "threads"},
     "__init__": PLANNING | {"studies", "units"},
 }
 # Heavy packages and the only places that may import them.

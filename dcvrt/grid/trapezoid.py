@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dcvrt.grid.evaluation import Evaluation
+
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
@@ -70,7 +72,8 @@ class Stepper:
         kvxopt: Any = import_module("kvxopt")  # the sparse matrices that ANDES works in
         self._klu = import_module("kvxopt.klu")
         self._matrix, self._sparse, self._spdiag = kvxopt.matrix, kvxopt.sparse, kvxopt.spdiag
-        self.system, self.dae, self.tds = system, system.dae, system.TDS
+        self.system, self.dae = system, system.dae
+        self.evaluate = Evaluation(system)
         self.models = system.exist.pflow_tds
         self.t = float(self.dae.t)
         self.n = int(self.dae.n)
@@ -84,11 +87,6 @@ class Stepper:
         self.evaluate(0)
 
     # -- what ANDES evaluates ------------------------------------------------------------------------------
-
-    def evaluate(self, iteration: int) -> None:
-        """Evaluate `f`, `g` and the limiters at the present `x` and `y`."""
-        self.tds.niter = iteration
-        self.tds.fg_update(models=self.models)
 
     def pegged(self) -> Integers:
         """States that a limiter holds."""

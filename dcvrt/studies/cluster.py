@@ -22,8 +22,7 @@ from typing import Any
 
 from dcvrt.errors import InputError
 from dcvrt.studies.campaign import Outcome, Task, TaskFunction, attempt
-
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+from dcvrt.threads import ONE_THREAD
 
 
 class Cluster:
