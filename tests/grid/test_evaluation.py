@@ -11,6 +11,10 @@ from dcvrt.grid.evaluation import Evaluation
 from tests.grid.live import CASES, FURTHER, fresh
 
 
+COMES_BACK = ("ieee39", "exst1")
+"""Cases whose limited states are pulled back from beyond a limit, so that no limiter has to hold them."""
+
+
 def evaluated(system: Any) -> tuple[Any, ...]:
     """What an evaluation leaves behind: equations, states put onto limits, flags of limiters."""
     dae = system.dae
@@ -32,7 +36,10 @@ def test_equations_are_those_of_andes_wherever_the_states_are(case: str) -> None
     x0, y0 = theirs.dae.x.copy(), theirs.dae.y.copy()
     pegged = 0
     for trial in range(8):
-        x = x0 + 0.1 * (2.0**trial - 1.0) * rng.standard_normal(len(x0))
+        x = x0 + 0.2 * trial * rng.standard_normal(len(x0))
+        for limiter in theirs.antiwindups if trial else ():  # beyond one limit or the other
+            above = rng.random(len(limiter.state.a)) > 0.5
+            x[limiter.state.a] = np.where(above, limiter.upper.v + 0.1, limiter.lower.v - 0.1)
         y = y0 + 0.02 * trial * rng.standard_normal(len(y0))
         for system in (theirs, ours):
             system.dae.x[:], system.dae.y[:] = x, y
@@ -43,4 +50,4 @@ def test_equations_are_those_of_andes_wherever_the_states_are(case: str) -> None
         for of_theirs, of_ours in zip(evaluated(theirs), evaluated(ours), strict=True):
             assert np.array_equal(of_theirs, of_ours, equal_nan=True)
         pegged += int((theirs.dae.x != x).sum())
-    assert pegged > 0 or not theirs.antiwindups  # limits were met on the way
+    assert pegged > 0 or case in COMES_BACK
