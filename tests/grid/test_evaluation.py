@@ -10,7 +10,6 @@ import pytest
 from dcvrt.grid.evaluation import Evaluation
 from tests.grid.live import CASES, FURTHER, fresh
 
-
 COMES_BACK = ("ieee39", "exst1")
 """Cases whose limited states are pulled back from beyond a limit, so that no limiter has to hold them."""
 
