@@ -246,9 +246,9 @@ def design(
     Each answer is replayed: it passes, and the value just below it fails. The network's own limits are not
     looked at; a study does that.
 
-    Exit codes: 0 every answer found; 2 bad input; 3 some value does not exist in its range;
+    Exit codes: 0 every answer found; 2 bad input; 3 some value does not exist in its range, or the grid
 
-    4 a fault has no simulation.
+    has no operating point at these capacities; 4 a fault has no simulation.
     """
     from dcvrt.studies import design as designing
     from dcvrt.studies.study import Study

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dcvrt.criteria import Criteria
-from dcvrt.errors import InputError, SimulationError, did_you_mean, first_sentence, raise_all
+from dcvrt.errors import InfeasibleError, InputError, SimulationError, did_you_mean, first_sentence, raise_all
 from dcvrt.planning import replay
 from dcvrt.planning.design import (
     DESIGNED,
@@ -203,6 +203,8 @@ def design(setting: Setting, ask: Ask) -> list[Answer]:
     ------
     InputError
         Everything that is wrong with the question.
+    InfeasibleError
+        The grid has no operating point at these capacities.
     SimulationError
         A fault that has no waveform: nothing can be said of any site then.
     """
@@ -222,15 +224,18 @@ def exposures_of(setting: Setting, ask: Ask) -> dict[int, tuple[Exposure, ...]]:
     """POI voltages of every site under all faults in all periods: one simulation of the grid for each."""
     H = [ask.hosting.get(bus, 0.0) for bus in setting.sites]
     found: dict[int, list[Exposure]] = {bus: [] for bus in setting.sites}
-    lost = []
+    impossible: list[str] = []
+    lost: list[str] = []
     for period in setting.periods:
         for fault, waveforms, status in replay.fault_runs(setting.request(H, period, [], engine=ask.engine)):
             if waveforms is None:
-                lost.append(status)
+                # A status that names no fault is that of the operating point, from which none could start.
+                (lost if fault in status else impossible).append(status)
                 continue
             for bus, waveform in waveforms.items():
                 found[bus].append(Exposure(period, fault, waveform, setting.d[period]))
-    raise_all(list(dict.fromkeys(lost)), "design", SimulationError)
+    raise_all(list(dict.fromkeys(impossible)), "design", InfeasibleError)
+    raise_all(lost, "design", SimulationError)
     return {bus: tuple(there) for bus, there in found.items()}
 
 

@@ -135,6 +135,26 @@ def test_no_answer_in_the_range_is_code_three_and_tells_what_stops_it(
     assert answer["best"]["value"] == 1.05
 
 
+@pytest.mark.parametrize("engine", ["native", "andes"])
+def test_capacities_that_the_grid_cannot_carry_have_no_answer(
+    file: Path, engine: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Code 3, the reason once for all faults; a fault that ends badly is another matter."""
+    assert run(str(file), "--hosting", "21=500", "--engine", engine) == 3
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("design: ieee118, peak: power flow has no solution")
+
+
+def test_a_fault_without_a_simulation_is_named(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = "ieee118, peak, fault at bus 25, 100 ms: lost synchronism at t = 0.9 s"
+    monkeypatch.setattr(designing.replay, "fault_runs", lambda request: [("bus 25, 100 ms", None, status)])
+    assert run(str(file), "--hosting", "21=30") == 4
+    assert status in capsys.readouterr().err
+
+
 def test_without_a_rating_nothing_else_is_sought(file: Path, tmp_path: Path) -> None:
     hasty = tmp_path / "hasty.toml"
     hasty.write_text(
