@@ -287,8 +287,9 @@ class StudyFile(BaseModel):
     def quick(self) -> StudyFile:
         """The same study with less of what takes time, to see within minutes that all of it works.
 
-        Fewer samples, periods, ratings and reruns; every fault, site and mode. The numbers are coarser,
-        and a folder made this way is not continued by a full run.
+        Fewer samples, periods, ratings and reruns, system limits at one of the ratings that they are asked
+        for; every fault, site and mode. The numbers are coarser, and a folder made this way is not continued
+        by a full run.
         """
         beta = self.facility.beta
         few = sorted({beta[0], beta[len(beta) // 3], beta[(2 * len(beta)) // 3], beta[-1]})
@@ -300,7 +301,7 @@ class StudyFile(BaseModel):
                 "sampling": self.sampling.model_copy(update={"n": min(self.sampling.n, 10)}),
                 "facility": self.facility.model_copy(update={"beta": few}),
                 "period": ends,
-                "system_limit": limits.model_copy(update={"beta": sorted(set(near)) or None}),
+                "system_limit": limits.model_copy(update={"beta": near[len(near) // 2 :][:1] or None}),
                 "sensitivity": self.sensitivity.model_copy(
                     update={"beta": None, "reruns": min(self.sensitivity.reruns, 1)}
                 ),

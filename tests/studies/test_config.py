@@ -54,6 +54,9 @@ def test_quick_keeps_faults_sites_and_modes() -> None:
     assert quick.facility.beta[-1] == file.facility.beta[-1]
     assert (quick.sensitivity.reruns, file.sensitivity.reruns) == (1, 3)
     assert quick.sensitivity.ranges == file.sensitivity.ranges
+    assert file.system_limit.beta is not None
+    assert quick.system_limit.beta is not None
+    assert len(quick.system_limit.beta) == 1 < len(file.system_limit.beta)
     checks.check(config.template(), "quick", HERE)
     assert not checks.contradictions({name: getattr(quick, name) for name in config.StudyFile.model_fields})
 
