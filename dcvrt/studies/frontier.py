@@ -186,7 +186,9 @@ class _Campaign:
         for ask, _ in questions:
             self._enter(ask, "p", self.roles[1])
         plans = [(self._name(ask, "p"), ask.H, list(runs)) for ask, runs in questions]
-        self.lost += simulations.replay_plans(self.campaign, self.setting, CANDIDATES, plans)
+        self.lost += simulations.simulate(
+            self.campaign, CANDIDATES, simulations.replay_jobs(self.setting, plans)
+        )
         return [
             exact_of(
                 [row for row in records(replayed) if (row["mode"], row["beta"]) in runs],

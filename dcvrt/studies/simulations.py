@@ -68,9 +68,9 @@ def run_replays(campaign: Campaign, setting: Setting) -> list[str]:
     plans = [p for p in records(store.plans()) if p["method"] != NO_VRT]
     limited = records(store.system_plans())
     wanted = {plan["hosting"]: _hosted(plan, setting) for plan in [*plans, *limited] if plan["total_mw"] > 0}
-    made = set(store.margins(hosting=list(wanted), leave=DETAILS).hosting)
-    open_plans = [(name, H, setting.runs) for name, H in wanted.items() if name not in made]
-    lost = replay_plans(campaign, setting, REPLAYS, open_plans)
+    jobs = replay_jobs(setting, [(name, H, setting.runs) for name, H in wanted.items()])
+    of_search = store.task_states(CANDIDATES)  # candidates are replayed for every mode and rating, too
+    lost = simulate(campaign, REPLAYS, [j for j in jobs if Task(CANDIDATES, j.request).key not in of_search])
     write_verdicts(store, setting, plans, limited)
     return lost
 
@@ -116,20 +116,16 @@ class Job:
     request: dict[str, Any]
 
 
-def replay_plans(
-    campaign: Campaign,
-    setting: Setting,
-    phase: str,
-    plans: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]],
-) -> list[str]:
-    """Replay hosting vectors, (name, capacities, modes and ratings), in every period under every fault."""
+def replay_jobs(
+    setting: Setting, plans: Sequence[tuple[str, Sequence[float], Sequence[tuple[str, float]]]]
+) -> list[Job]:
+    """What is simulated for the replay of hosting vectors."""
     engine = setting.file.replay.engine
-    jobs = [
+    return [
         Job(name, setting.request(H, period, runs, engine=engine, keep=True))
         for period in setting.periods
         for name, H, runs in plans
     ]
-    return simulate(campaign, phase, jobs)
 
 
 def simulate(campaign: Campaign, phase: str, jobs: Sequence[Job]) -> list[str]:

@@ -10,6 +10,7 @@ import pytest
 
 from dcvrt.planning import replay
 from dcvrt.studies import frontier, simulations
+from dcvrt.studies import plans as plans_module
 from dcvrt.studies.campaign import Campaign, crew_of
 from dcvrt.studies.progress import Silent
 from dcvrt.studies.setting import Setting
@@ -30,6 +31,51 @@ def every_site() -> Setting:
 def plans_of(folder: Path) -> list[dict[str, Any]]:
     with Store(folder / "study.sqlite") as store:
         return records(store.plans())
+
+
+def with_another_plan(folder: Path, study: Setting) -> None:
+    """Search, then add a plan of another method, which the search has not replayed."""
+    folder.mkdir()
+    with Store(folder / "study.sqlite", write=True) as store, crew_of(1) as crew:
+        assert frontier.run_frontier(Campaign(store, crew), study, Silent()) == []
+        known = next(p for p in records(store.plans()) if p["total_mw"] > 0)
+        by_site = {bus: 0.9 * mw for bus, mw in known["by_site"].items()}
+        other = {"method": "paper", "by_site": by_site, "total_mw": sum(by_site.values()), "search": {}}
+        store.put("plans", [known | other | {"hosting": plans_module.plan_name(by_site), "replayed": 0}])
+
+
+def verdicts(folder: Path, study: Setting) -> list[tuple[Any, ...]]:
+    """Of all plans, after the replays that are missing."""
+    with Store(folder / "study.sqlite", write=True) as store, crew_of(1) as crew:
+        assert simulations.run_replays(Campaign(store, crew), study) == []
+        names = ("method", "mode", "beta", "passed", "n_failed", "aggregate_loss_mw")
+        return [tuple(str(plan[name]) for name in names) for plan in records(store.plans())]
+
+
+def test_replays_that_were_interrupted_between_periods_are_ended_and_no_more(
+    tmp_path: Path, asked: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = every_site()
+    with_another_plan(tmp_path / "whole", study)
+    asked.clear()
+    whole = verdicts(tmp_path / "whole", study)
+    assert [r["period"]["name"] for r in asked] == list(PERIODS)  # of the other plan alone
+    with_another_plan(tmp_path / "cut", study)
+    answer, made = replay.check_hosting, []
+
+    def once(request: dict[str, Any]) -> dict[str, Any]:
+        if made:
+            raise KeyboardInterrupt
+        made.append(request)
+        return answer(request)
+
+    with monkeypatch.context() as cut:
+        cut.setattr(replay, "check_hosting", once)
+        with pytest.raises(KeyboardInterrupt):
+            verdicts(tmp_path / "cut", study)
+    asked.clear()
+    assert verdicts(tmp_path / "cut", study) == whole
+    assert len(asked) == len(PERIODS) - 1
 
 
 def test_coarse_samples_begin_with_everything_and_next_to_nothing() -> None:
