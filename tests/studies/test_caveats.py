@@ -94,7 +94,7 @@ def test_power_flow_writes_the_excess_and_the_replay_keeps_it(folder: Path) -> N
     row = power_flow(SimpleNamespace(check_ac=lambda plan: verdict), None)  # type: ignore[arg-type]
     change(folder, **row, replayed=0)
     setting = SimpleNamespace(
-        file=study_file("again"), sites=SITES, periods=PERIODS, request=lambda *_, **__: {}
+        file=study_file("again"), sites=SITES, periods=PERIODS, runs=[], request=lambda *_, **__: {}
     )
     with Store(folder / "study.sqlite", write=True) as store:
         campaign = SimpleNamespace(store=store, run=lambda *_: [])
