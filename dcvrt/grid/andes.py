@@ -14,6 +14,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ from dcvrt.grid.units import Unit
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
 
+ADDED = 1e-8
+"""What ANDES adds to the resistance and the reactance of every branch, pu."""
 NO_MACHINES = (
     "{where}: the case has no dynamic data, not one machine. Way out: add a machine (GENROU, GENCLS) "
     "for each "
@@ -282,6 +285,16 @@ def read_network(path: Path, dynamics: Path | None, name: str) -> Network:
         ),
         slack_angle=float(system.Slack.a0.v[0]) if system.Slack.n else 0.0,
     )
+
+
+def branches_of(network: Network) -> Network:
+    """The network with branches as ANDES has them: it adds 1e-8 pu to every resistance and reactance.
+
+    One engine simulates a grid and the other replays it. The addition moves voltages by 1e-7 pu, and states
+    of small machines by more; with it in both they solve the same equations.
+    """
+    lines = network.branches
+    return replace(network, branches=replace(lines, r=lines.r + ADDED, x=lines.x + ADDED))
 
 
 def read_units(path: Path, dynamics: Path | None, machines: Sequence[Machine], name: str) -> tuple[Unit, ...]:

@@ -142,8 +142,9 @@ class Grid:
 
     @cached_property
     def network(self) -> Network:
-        """Buses, branches and units."""
-        return Network.ieee118() if self.rule else andes.read_network(self.path, self.dynamics, self.name)
+        """Buses, branches and units, as both engines have them."""
+        read = Network.ieee118() if self.rule else andes.read_network(self.path, self.dynamics, self.name)
+        return andes.branches_of(read)
 
     def __getstate__(self) -> dict[str, object]:
         return {
