@@ -1,19 +1,24 @@
-"""f and g of a loaded ANDES system, evaluated by the functions that ANDES has generated for them.
+"""f, g and their Jacobian of a loaded ANDES system, evaluated by the functions that ANDES has generated for
+them.
 
-The same calls in the same order as `TDS.fg_update` of ANDES, and the same numbers to the last bit. It leaves
-out models that have nothing to do in a call, and adds up what models give in one pass instead of one a
-variable: together a sixth of a replay.
+The same calls in the same order as `TDS.fg_update` and `System.j_update` of ANDES, and of f and g the same
+numbers to the last bit. It leaves out models that have nothing to do in a call, and takes what models give in
+one pass instead of one a variable, and without a sparse matrix to add each part to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+
+BLOCKS = ("fx", "fy", "gx", "gy")
+"""Jacobians of f and g by states and by algebraic variables, as ANDES calls them."""
 
 
 class Evaluation:
@@ -54,6 +59,60 @@ class Evaluation:
         for limiter in system.antiwindups:
             for address, value, _ in limiter.x_set:
                 np.put(system.dae.x, address, value)
+
+
+class Jacobian:
+    """Entries of the Jacobian of (f, g) by (x, y), several of which may stand at one place.
+
+    Parameters
+    ----------
+    system : andes.System
+        After `TDS.init`.
+
+    Attributes
+    ----------
+    row, column : int arrays (entries,)
+        States first, then algebraic variables.
+    """
+
+    def __init__(self, system: Any) -> None:
+        self.system, self.models = system, system.exist.pflow_tds
+        n, m = int(system.dae.n), int(system.dae.m)
+        rows, columns, self._constant = [], [], []
+        for block in BLOCKS:
+            first_row, first_column = n * (block[0] == "g"), n * (block[1] == "y")
+            constant = system.dae.tpl[block]
+            self._constant.append(np.ravel(constant.V))
+            places = [(constant.I, constant.J), *((i, j) for i, j, _ in self._of_models(block))]
+            rows += [np.ravel(i).astype(np.int64) + first_row for i, _ in places]
+            columns += [np.ravel(j).astype(np.int64) + first_column for _, j in places]
+        every = np.arange(n + m)
+        self.row, self.column = np.concatenate([*rows, every]), np.concatenate([*columns, every])
+        self._diagonal = np.zeros(n + m)
+        self._islanded = np.zeros(0, dtype=np.int64)
+        if system.Bus.n_islanded_buses:  # rows of their own, as in `System.j_islands`
+            alone = n + np.concatenate([system.Bus.islanded_a, system.Bus.islanded_v]).astype(np.int64)
+            self._islanded = np.flatnonzero(np.isin(self.row, alone))
+            self._diagonal[alone] = system.config.diag_eps
+        self._own = np.flatnonzero((self.row == self.column) & (self.row < n))
+
+    def _of_models(self, block: str) -> Iterator[tuple[Any, Any, Any]]:
+        for model in self.models.values():
+            yield from model.triplets.zip_ijv(block)
+
+    def __call__(self) -> Floats:
+        """Values of the entries at the present `x` and `y`."""
+        self.system.call_models("j_update", self.models)
+        parts = []
+        for block, constant in zip(BLOCKS, self._constant, strict=True):
+            parts += [constant, *(np.ravel(values) for _, _, values in self._of_models(block))]
+        values = np.concatenate([*parts, self._diagonal])
+        values[self._islanded[self._islanded < len(values) - len(self._diagonal)]] = 0.0
+        return values
+
+    def own_rates(self, values: Floats) -> Floats:
+        """Derivative of the rate of each state by itself."""
+        return np.bincount(self.row[self._own], values[self._own], int(self.system.dae.n)).astype(float)
 
 
 class _Sum:

@@ -11,9 +11,11 @@ import numpy.typing as npt
 from dcvrt.errors import InputError, SimulationError
 from dcvrt.grid import redispatch
 from dcvrt.grid.andes import NO_MACHINES, Said, quiet
+from dcvrt.grid.copy_run import CopyRun
 from dcvrt.grid.faults import Fault, Stage
 from dcvrt.grid.native.fleet import ON_LIMIT
-from dcvrt.grid.trapezoid import NoConvergenceError, Stepper
+from dcvrt.grid.repeated import Copies
+from dcvrt.grid.trapezoid import Stepper
 
 Floats = npt.NDArray[np.float64]
 Phasors = npt.NDArray[np.complex128]
@@ -26,10 +28,6 @@ SLACK_TOLERANCE = 1e-7
 """Largest difference between the unit at the slack bus and its share, pu."""
 Q_TOLERANCE = 1e-6
 """Reactive power beyond a limit that counts as on it, pu."""
-COLLAPSED = 0.01
-"""Voltage just after clearing, pu, below which the faulted bus counts as not recovered."""
-LOST_SYNCHRONISM = np.pi
-"""Angle between a rotor and the centre of inertia, rad, from which on the rotor counts as out of step."""
 
 
 class OperatingPoint:
@@ -50,6 +48,8 @@ class OperatingPoint:
         What messages call the operating point.
     set_points : mapping of bus to pu, optional
         Voltages held instead of those of the case: where a unit at its reactive limit cannot hold its own.
+    copies : int
+        How many faults are simulated at a time.
 
     Raises
     ------
@@ -69,6 +69,7 @@ class OperatingPoint:
         rule: str,
         where: str,
         set_points: Mapping[int, float] | None = None,
+        copies: int = 1,
     ) -> None:
         self.system, self.where, self.faults = system, where, faults
         base = float(system.config.mva)
@@ -83,19 +84,29 @@ class OperatingPoint:
         for (bus, admittance), idx in self.fault_index.items():
             z = 1.0 / admittance
             system.add("Fault", {"idx": idx, "bus": bus, "tf": -1.0, "tc": -1.0, "xf": z.imag, "rf": z.real})
+        self.copies = Copies(system, copies)
+        self.buses = int(system.Bus.n) // copies
         with quiet() as said:
             system.setup()
-            self.lines = [system.Line.idx.v[k] for k in np.flatnonzero(system.Line.u.v)]
+            self.lines = [system.Line.idx.v[k] for k in np.flatnonzero(self._one(system.Line.u.v))]
             if not system.SynGen.n:
                 raise InputError(NO_MACHINES.format(where=where))
-            reference = float(system.PQ.p0.v[:loads] @ system.PQ.u.v[:loads])
-            system.PQ.p0.v[:loads] *= load_scale
-            system.PQ.q0.v[:loads] *= load_scale
+            load = self._one(system.PQ.p0.v) * self._one(system.PQ.u.v)
+            for power in (system.PQ.p0.v, system.PQ.q0.v):
+                power.reshape(copies, -1)[:, :loads] *= load_scale
+            more = float((self._one(system.PQ.p0.v) * self._one(system.PQ.u.v)).sum() - load[:loads].sum())
             for units in (system.PV, system.Slack):
-                for k, bus in enumerate(units.bus.v):
-                    units.v0.v[k] = (set_points or {}).get(bus, units.v0.v[k])
-            self._power_flow(rule, float(system.PQ.p0.v @ system.PQ.u.v) - reference)
+                held = [
+                    (set_points or {}).get(bus, v)
+                    for bus, v in zip(units.bus.v, self._one(units.v0.v), strict=False)
+                ]
+                units.v0.v[:] = np.tile(held, copies)
+            self._power_flow(rule, more)
             self._initialise(said)
+
+    def _one(self, values: Any) -> Any:
+        """Of values of all devices of a model those of one copy: all copies start alike."""
+        return np.asarray(values[: len(values) // self.copies.count])
 
     # -- power flow ----------------------------------------------------------------------------------------
 
@@ -104,28 +115,29 @@ class OperatingPoint:
         system, slack = self.system, self.system.Slack
         system.PFlow.config.tol = POWER_FLOW_TOLERANCE
         units = (system.PV, slack)
-        p_set = np.concatenate([unit.p0.v * unit.u.v for unit in units])
-        p_max = np.concatenate([unit.pmax.v for unit in units])
+        p_set = np.concatenate([self._one(unit.p0.v * unit.u.v) for unit in units])
+        p_max = np.concatenate([self._one(unit.pmax.v) for unit in units])
+        held = int(system.PV.n) // self.copies.count
         if rule == "slack":
             self._solve()
         else:
             total, surplus = float(p_set.sum()) + more, np.inf
             while abs(surplus) > SLACK_TOLERANCE:  # contracts: the losses change by a small part of the load
                 p = redispatch.share(p_set, p_max, total, float(system.config.mva), self.where)
-                system.PV.p0.v[:] = p[: system.PV.n]
+                system.PV.p0.v[:] = np.tile(p[:held], self.copies.count)
                 self._solve()
-                surplus = float(slack.p.v.sum() - p[system.PV.n :].sum())
+                surplus = float(self._one(slack.p.v).sum() - p[held:].sum())
                 total += surplus
         base = float(system.config.mva)
         self.generation: dict[int, complex] = {}
         for unit in units:
-            for bus, p, q in zip(unit.bus.v, unit.p.v, unit.q.v, strict=True):
+            for bus, p, q in zip(unit.bus.v, self._one(unit.p.v), self._one(unit.q.v), strict=False):
                 self.generation[int(bus)] = self.generation.get(int(bus), 0j) + base * complex(p, q)
         self.beyond_q_limits = tuple(
             int(unit.bus.v[k])
             for unit in units
             for k in np.flatnonzero(
-                (unit.q.v > unit.qmax.v + Q_TOLERANCE) | (unit.q.v < unit.qmin.v - Q_TOLERANCE)
+                self._one((unit.q.v > unit.qmax.v + Q_TOLERANCE) | (unit.q.v < unit.qmin.v - Q_TOLERANCE))
             )
         )
         if not (slack.p.v >= 0).all() or not (slack.p.v <= slack.pmax.v).all():
@@ -142,7 +154,7 @@ class OperatingPoint:
         if system.PFlow.converged:
             return
         bus = system.Bus
-        mismatch = np.hypot(system.dae.g[bus.a.a], system.dae.g[bus.v.a])
+        mismatch = self._one(np.hypot(system.dae.g[bus.a.a], system.dae.g[bus.v.a]))
         worst = int(np.argmax(np.nan_to_num(mismatch, nan=np.inf)))
         raise SimulationError(
             f"{self.where}: power flow has no solution; the largest mismatch, "
@@ -173,7 +185,7 @@ class OperatingPoint:
             raise SimulationError(f"{self.where}: ANDES could not initialise the dynamic devices. {said}")
         moved, notes = [], []
         for (model, limit), value in zip(limits, before, strict=True):
-            for k in np.flatnonzero(limit.v != value):
+            for k in np.flatnonzero(self._one(limit.v != value)):
                 name = f"{model.class_name} '{model.idx.v[k]}'"
                 beyond = abs(limit.v[k] - value[k])
                 if beyond > ON_LIMIT:
@@ -189,9 +201,12 @@ class OperatingPoint:
                 f"{more}. ANDES would widen them and say nothing. Way out: host less, or give the unit a "
                 "wider limit."
             )
-        residual = np.abs(system.dae.fg)
+        self.variables = self.copies.variables()
+        x, y = self.variables[0]
+        own = np.concatenate([x, y + int(system.dae.n)])
+        residual = np.abs(system.dae.fg[own])
         worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
-        size, name = float(residual[worst]), system.dae.xy_name[worst]
+        size, name = float(residual[worst]), system.dae.xy_name[own[worst]]
         clipped = self._clipped() if FLAT_START_TOLERANCE < size <= ON_LIMIT else []
         if not (size <= FLAT_START_TOLERANCE or clipped):
             raise SimulationError(
@@ -210,7 +225,7 @@ class OperatingPoint:
             for part in model.discrete.values()
             if type(part).__name__.startswith("AntiWindup")
             for side, flag in (("lower", part.zl), ("upper", part.zu))
-            for k in np.flatnonzero(flag)
+            for k in np.flatnonzero(self._one(flag))
         ]
 
     @property
@@ -218,7 +233,7 @@ class OperatingPoint:
         """Bus voltages before the fault, pu, in the order of the buses."""
         bus = self.system.Bus
         y = self.system.TDS._y_t0
-        return np.asarray(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
+        return self._one(y[bus.v.a] * np.exp(1j * y[bus.a.a]))
 
     def machine_admittance(self, reactance: Literal["subtransient", "transient"]) -> Phasors:
         """Admittance between each bus and the internal voltage of its machines, pu, in bus order.
@@ -231,13 +246,13 @@ class OperatingPoint:
         """
         system = self.system
         position = {idx: k for k, idx in enumerate(system.Bus.idx.v)}
-        y = np.zeros(system.Bus.n, dtype=complex)
+        y = np.zeros(int(system.Bus.n), dtype=complex)
         for model in system.SynGen.models.values():
             if model.n:
                 subtransient = reactance == "subtransient" and hasattr(model, "xd2")
                 x = 0.5 * (model.xd2.v + model.xq2.v) if subtransient else model.xd1.v
                 np.add.at(y, [position[bus] for bus in model.bus.v], model.ue.v / (model.ra.v + 1j * x))
-        return y
+        return self._one(y)
 
     def load_admittance(self) -> Phasors:
         """Admittance of the loads at the voltages before the fault, pu, in the order of the buses.
@@ -245,117 +260,82 @@ class OperatingPoint:
         They keep it in the fault.
         """
         system = self.system
-        position = [list(system.Bus.idx.v).index(bus) for bus in system.PQ.bus.v]
-        y = np.zeros(system.Bus.n, dtype=complex)
-        load = system.PQ.u.v * (system.PQ.p0.v - 1j * system.PQ.q0.v)
+        load = self._one(system.PQ.u.v * (system.PQ.p0.v - 1j * system.PQ.q0.v))
+        place = {idx: k for k, idx in enumerate(system.Bus.idx.v)}
+        position = [place[bus] for bus in self._one(np.array(system.PQ.bus.v))]
+        y = np.zeros(self.buses, dtype=complex)
         np.add.at(y, position, load / np.abs(self.v0[position]) ** 2)
         return y
 
     # -- faults --------------------------------------------------------------------------------------------
 
-    def simulate(self, fault: Fault, times: Sequence[Floats], buses: Sequence[int]) -> tuple[Phasors, str]:
+    def simulate(
+        self, faults: Sequence[Fault], times: Sequence[Floats], buses: Sequence[int]
+    ) -> list[tuple[Phasors, str]]:
         """Voltages at `buses` on the times of the stretches between the changes of the network.
 
         Parameters
         ----------
-        fault : BusFault, LineTrip or FaultSequence
-            One of those the operating point was made for.
+        faults : sequence of BusFault, LineTrip or FaultSequence
+            Of those the operating point was made for, at most as many as there are copies; their networks
+            change at the same times.
         times : sequence of arrays
-            One for each stage of the fault. The first ends where the second begins, and so on; both sides of
+            One for each stage of the faults. The first ends where the second begins, and so on; both sides of
             a jump are returned.
 
         Returns
         -------
-        v : complex array (times, buses)
-            Up to the time reached.
-        status : str
-            Empty when the end was reached, else the sentence that says what happened.
+        list of (complex array (times, buses), str)
+            For each fault the voltages up to the time reached, and how it ended: empty when the end was
+            reached, else the sentence that says what happened.
         """
         with quiet():
-            try:
-                return self._simulate(self.faults[fault], times, buses)
-            finally:
-                self._enter(Stage(0.0))
-
-    def _enter(self, stage: Stage) -> None:
-        """Put the network into a stage: its faults on, its open branches out."""
-        system = self.system
-        for item, idx in self.fault_index.items():
-            system.Fault.uf.v[system.Fault.idx2uid(idx)] = float(item in stage.shunts.items())
-        for k, idx in enumerate(self.lines):
-            if system.Line.u.v[system.Line.idx2uid(idx)] != (k not in stage.out):
-                system.set_status("Line", idx, float(k not in stage.out))
+            found = self._simulate(faults, times, buses)
+            if len(faults) > 1:  # one that wants shorter steps than the others is simulated by itself
+                for k, run in enumerate(found):
+                    if run.collapsed:
+                        found[k] = self._simulate([faults[k]], times, buses)[0]
+        return [(np.array(run.samples), run.status) for run in found]
 
     def _simulate(
-        self, stages: Sequence[Stage], times: Sequence[Floats], buses: Sequence[int]
-    ) -> tuple[Phasors, str]:
+        self, faults: Sequence[Fault], times: Sequence[Floats], buses: Sequence[int]
+    ) -> list[CopyRun]:
         system = self.system
+        for copy in range(self.copies.count):
+            self.enter(Stage(0.0), copy)
         system.TDS.reinit()
-        place = {bus: k for k, bus in enumerate(system.Bus.idx.v)}
-        address = [place[bus] for bus in buses]
-        magnitude, angle = system.Bus.v.a[address], system.Bus.a.a[address]
-        samples: list[Phasors] = []
-
-        def record() -> None:
-            y = system.dae.y
-            samples.append(y[magnitude] * np.exp(1j * y[angle]))
-
-        for _ in times[0]:  # an equilibrium, checked in `_initialise`: nothing moves before the fault
-            record()
-        stepper = Stepper(system)
-        stepper.t = stages[1].begin
-        rotor = _Rotors(system)
         before = system.dae.y.copy()
-        what = ""
-        try:
-            for last, stage, stretch in zip(stages[:-1], stages[1:], times[1:], strict=True):
-                cleared = [bus for bus in last.shunts if bus not in stage.shunts]
-                what = "inception" if stage.shunts else "clearing" if cleared else "a change of branches"
-                self._enter(stage)
-                # In polar form V = 0 solves the balance of a bus without load, so that a search which starts
-                # from the voltages of the fault ends there: the fault would never be cleared. Start from
-                # those before it.
-                stepper.event(before if cleared else system.dae.y.copy())
-                for bus in cleared:
-                    if system.Bus.v.v[place[bus]] < COLLAPSED:
-                        raise NoConvergenceError(stage.begin, f"the voltage at bus {bus}")
-                record()
-                for t in stretch[1:]:
+        stepper = Stepper(system, self.variables[: len(faults)])
+        runs = [CopyRun(self, copy, self.faults[fault], buses) for copy, fault in enumerate(faults)]
+        for _ in times[0]:  # an equilibrium, checked in `_initialise`: nothing moves before the fault
+            for run in runs:
+                run.record()
+        for number, stretch in enumerate(times[1:], start=1):
+            stepper.t = float(stretch[0])
+            guess = system.dae.y.copy()
+            for copy in stepper.active:
+                runs[copy].enter(number, guess, before)
+            stepper.event(guess)
+            for copy in list(stepper.active):
+                if not runs[copy].recovered():
+                    stepper.active.remove(copy)
+            for t in stretch:
+                if t > stretch[0]:
                     stepper.advance(float(t))
-                    record()
-                    lost = rotor.out_of_step()
-                    if lost:
-                        return np.array(samples), f"lost synchronism at t = {t:.3f} s: {lost}."
-        except NoConvergenceError as failure:
-            v = system.Bus.v.v
-            low = int(np.argmin(v))
-            return np.array(samples), (
-                f"voltage collapse or numerical failure after {what}, at t = {failure.t:.4f} s: no "
-                f"solution near the last one; {failure.variable} did not settle; lowest voltage "
-                f"{v[low]:.2f} pu "
-                f"at bus {system.Bus.idx.v[low]}."
-            )
-        finally:
-            self.iterations, self.factorisations = stepper.iterations, stepper.factorisations
-        return np.array(samples), ""
+                for copy in list(stepper.active):
+                    if not runs[copy].record():
+                        stepper.active.remove(copy)
+        for copy, failure in stepper.lost.items():
+            runs[copy].collapse(failure.t, failure.variable)
+        self.iterations, self.factorisations = stepper.iterations, stepper.factorisations
+        return runs
 
-
-class _Rotors:
-    """Rotor angles of all machines against their centre of inertia."""
-
-    def __init__(self, system: Any) -> None:
-        models = [model for model in system.SynGen.models.values() if model.n]
-        self.system = system
-        self.address = np.concatenate([model.delta.a for model in models])
-        self.inertia = np.concatenate([model.M.v * model.ue.v for model in models])
-        self.name = [f"{model.class_name} '{idx}'" for model in models for idx in model.idx.v]
-        self.on = self.inertia > 0
-
-    def out_of_step(self) -> str:
-        """Say which machine is furthest from the centre of inertia, when that is half a turn or more."""
-        delta = self.system.dae.x[self.address]
-        away = np.where(self.on, np.abs(delta - delta @ self.inertia / self.inertia.sum()), 0.0)
-        k = int(np.argmax(away))
-        if away[k] <= LOST_SYNCHRONISM:
-            return ""
-        return f"{self.name[k]} is {np.rad2deg(away[k]):.0f} deg from the centre of inertia"
+    def enter(self, stage: Stage, copy: int) -> None:
+        """Put the network of a copy into a stage: its faults on, its open branches out."""
+        system, name = self.system, self.copies.name
+        for item, idx in self.fault_index.items():
+            system.Fault.uf.v[system.Fault.idx2uid(name(idx, copy))] = float(item in stage.shunts.items())
+        for k, idx in enumerate(self.lines):
+            line = name(idx, copy)
+            if system.Line.u.v[system.Line.idx2uid(line)] != (k not in stage.out):
+                system.set_status("Line", line, float(k not in stage.out))

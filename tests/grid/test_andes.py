@@ -246,6 +246,7 @@ class TestEveryOperatingPoint:
             stepper = Stepper(point.system)
             for t in np.linspace(0.0, 1.0, 121)[1:]:
                 stepper.advance(float(t))
+        assert not stepper.lost
         bus = point.system.Bus
         assert np.abs(bus.v.v * np.exp(1j * bus.a.v) - v0).max() < 1e-6
         assert np.abs(point.system.dae.x - x0).max() < 1e-6

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kvxopt import matrix
 
-from dcvrt.grid.evaluation import Evaluation
+from dcvrt.grid.evaluation import BLOCKS, Evaluation, Jacobian
 from tests.grid.live import CASES, FURTHER, fresh
 
 COMES_BACK = ("ieee39", "exst1")
@@ -50,3 +51,22 @@ def test_equations_are_those_of_andes_wherever_the_states_are(case: str) -> None
             assert np.array_equal(of_theirs, of_ours, equal_nan=True)
         pegged += int((theirs.dae.x != x).sum())
     assert pegged > 0 or case in COMES_BACK
+
+
+@pytest.mark.parametrize("case", ["ieee118", *CASES, *FURTHER])
+def test_the_jacobian_is_that_of_andes(case: str) -> None:
+    system = fresh(case)
+    jacobian, dae, rng = Jacobian(system), system.dae, np.random.default_rng(3)
+    x0, y0, n, m = dae.x.copy(), dae.y.copy(), int(dae.n), int(dae.m)
+    for size in (0.0, 0.02):
+        dae.x[:], dae.y[:] = x0 + size * rng.standard_normal(n), y0 + size * rng.standard_normal(m)
+        system.vars_to_models()
+        system.TDS.fg_update(models=system.exist.pflow_tds)
+        values = jacobian()
+        ours = np.zeros((n + m, n + m))
+        np.add.at(ours, (jacobian.row, jacobian.column), values)
+        system.j_update(models=system.exist.pflow_tds)
+        parts = [np.array(matrix(getattr(dae, block))) for block in BLOCKS]
+        theirs = np.block([parts[:2], parts[2:]])
+        assert np.abs(ours - theirs).max() <= 1e-13 * np.abs(theirs).max()
+        assert jacobian.own_rates(values) == pytest.approx(np.diag(theirs)[:n], abs=1e-12)

@@ -259,6 +259,7 @@ def andes_run(case: str, step: float) -> tuple[Any, np.ndarray, np.ndarray, np.n
                 t.append(float(time))
                 x.append(ss.dae.x.copy())
                 y.append(ss.dae.y.copy())
+        assert not stepper.lost
         ss.dae.x[:], ss.dae.y[:] = x[0], y[0]
         ss.vars_to_models()
     return ss, np.array(t), np.array(x), np.array(y)
