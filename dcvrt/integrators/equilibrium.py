@@ -26,6 +26,9 @@ RESIDUAL_TOLERANCE = 1e-9
 ROUGH, POLISH = 1e-3, 2
 """Below this residual Newton's method is quadratic: so many full steps take it to round-off."""
 MAX_ITERATIONS = 60
+STUCK = 1e-4
+"""A search that may go no further than this share of a step of Newton ends: it stands where the residual is
+least, at limits that exclude each other or at a fold."""
 
 
 def equilibrium(
@@ -69,7 +72,7 @@ def equilibrium(
             if new <= (1 - 0.25 * cut) * size or new < RESIDUAL_TOLERANCE:
                 break
             cut /= 2
-            if cut < 1e-6:
+            if cut < STUCK:
                 _fail(equations, residual[:, 0], q, where)
         w = w + cut * step
         undamped += cut == 1.0 and size < ROUGH
