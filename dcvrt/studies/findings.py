@@ -154,8 +154,14 @@ class Findings:
         with self._store() as store:
             return list(store.waveforms(**where))
 
+    @cached_property
+    def _whole(self) -> Path:
+        """The store, once it is known to be whole."""
+        with Store(self.folder / "study.sqlite") as store:
+            return store.path
+
     def _store(self) -> Store:
-        return Store(self.folder / "study.sqlite")
+        return Store(self._whole, check=False)
 
     # -- its dimensions ------------------------------------------------------------------------------------
 

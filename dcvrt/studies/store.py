@@ -166,6 +166,7 @@ class Store:
     ----------
     path : path of the file.
     write : open for writing: the file is made when it is not there, and no other writer is let in.
+    check : look through the pages of the file; false where that has just been done.
 
     Raises
     ------
@@ -174,7 +175,7 @@ class Store:
         writing.
     """
 
-    def __init__(self, path: str | Path, write: bool = False) -> None:
+    def __init__(self, path: str | Path, write: bool = False, check: bool = True) -> None:
         self.path = Path(path)
         if not write and not self.path.is_file():
             raise InputError(
@@ -203,7 +204,7 @@ class Store:
                 f"{self.path}: store version {version}, this dcvrt reads version {VERSION}. "
                 "Way out: run the study again into a new folder."
             )
-        if (damage := self.integrity()) != "ok":
+        if check and (damage := self.integrity()) != "ok":
             self.close()
             raise InputError(
                 f"{self.path}: the file is damaged ({damage}). Way out: put a copy of it back, or run the "
