@@ -85,11 +85,12 @@ def _row(
 def fault_runs(store: Store, margins: pd.DataFrame) -> pd.DataFrame:
     """The first facility run of every fault simulation; in closed loop each mode and rating has its own."""
     study = store.provenance().get("study")
-    closed = study is not None and study["grid"]["coupling"] == "closed"
+    if study is None or study["grid"]["coupling"] != "closed":
+        return margins.drop_duplicates(["hosting", "period", "fault"])
     roles = dict(zip(store.hostings().name, store.hostings().role, strict=True))
     kinds = [KINDS[roles[name]] for name in margins.hosting]
     runs = zip(kinds, margins["mode"], margins.beta, strict=True)
-    own = ["" if not closed or kind.endswith("replay") else f"{mode} {beta}" for kind, mode, beta in runs]
+    own = ["" if kind.endswith("replay") else f"{mode} {beta}" for kind, mode, beta in runs]
     keyed = margins.assign(run=own)
     return keyed.drop_duplicates(["hosting", "period", "fault", "run"])
 
