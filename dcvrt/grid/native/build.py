@@ -38,7 +38,7 @@ class GroupStruct(Structure):
             for name in (
                 "units", "lanes", "packs", "nx", "np", "nq", "na", "rows", "bounds", "moving", "fixed",
                 "fixed_columns",
-                "ports", "v_rows", "first_port", "first_feed", "first_state", "reads_v", "angle",
+                "ports", "v_rows", "first_port", "first_feed", "first_state", "reads_v", "quick", "angle",
             )
         ),
         ("tolerance", c_double),
@@ -83,7 +83,7 @@ class OptionsStruct(Structure):
     """struct options."""
 
     _fields_ = (
-        *((n, c_double) for n in ("rtol", "atol", "theta_rtol", "theta_share", "longest", "out_of_step")),
+        *((n, c_double) for n in ("rtol", "atol", "theta_rtol", "theta_share", "longest", "out_of_step", "worth")),
         ("max_steps", c_long),
     )  # fmt: skip
 
@@ -137,7 +137,7 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "products.h", "voltages.h", "steps.h", "events.h")
+    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "products.h", "voltages.h", "steps.h", "nested.h", "events.h")
     files = _files(*headers, "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))

@@ -263,7 +263,7 @@ class Engine:
                 )
                 for bus in buses
             ]
-            made.append(Group(structure, units, tolerance=SEEN_OF_A_FACILITY))
+            made.append(Group(structure, units, tolerance=SEEN_OF_A_FACILITY, quick=True))
         return tuple(made)
 
     def _structure_of(self, facility: Diagram | Dae) -> Structure:

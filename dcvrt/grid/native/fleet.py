@@ -61,12 +61,16 @@ class Group:
         `wind`.
     tolerance : float
         Error of its states in a run, over that of the run's options.
+    quick : bool
+        Whether its lags are shorter than those of the others, so that it may take steps of its own inside
+        theirs. Such groups are the last ones.
     """
 
     structure: Structure
     units: Sequence[Unit]
     power: str = "generation"
     tolerance: float = 1.0
+    quick: bool = False
 
     @cached_property
     def p(self) -> Floats:

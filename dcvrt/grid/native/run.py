@@ -62,6 +62,9 @@ class Options:
         Longest step, s.
     out_of_step : float
         Angle from the centre of inertia, rad, from which on a rotor counts as out of step.
+    worth : float
+        How many times longer a step of the machines has to be when facilities take steps of their own inside
+        it, for them to do so: 0 lets them always, infinity never.
     max_steps : int
     """
 
@@ -71,6 +74,7 @@ class Options:
     theta_share: float = 1e-2
     longest: float = 0.1
     out_of_step: float = np.pi
+    worth: float = 1.5
     max_steps: int = 200_000
 
 
@@ -252,6 +256,7 @@ class Fleet:
             bounds=len(structure.bounds), moving=len(structure.moving), fixed=obj.fixed,
             fixed_columns=obj.fixed_columns,
             reads_v=int(not structure.affine),
+            quick=int(group.quick),
             angle=dae.x_names.index(structure.angle) if structure.angle else -1,
             tolerance=group.tolerance,
             p=doubles(in_lanes(eq.p, lanes)),
@@ -355,7 +360,7 @@ def simulate(
     start = np.r_[v_start.real, v_start.imag].astype(float)
     o = options
     settings = OptionsStruct(
-        o.rtol, o.atol, o.theta_rtol, o.theta_share, o.longest, o.out_of_step, o.max_steps
+        o.rtol, o.atol, o.theta_rtol, o.theta_share, o.longest, o.out_of_step, o.worth, o.max_steps
     )
     code = dll.fleet_run(
         byref(fleet.struct), byref(settings), len(stretches), table, _pointer(x), _pointer(xs),

@@ -2,7 +2,7 @@
 #ifndef DCVRT_EVENTS_H
 #define DCVRT_EVENTS_H
 
-#include "steps.h"
+#include "nested.h"
 
 static double *guards_of(struct run *r, const struct group *g, long pack, double t, const struct state *x,
                          const struct moment *m)
@@ -11,14 +11,15 @@ static double *guards_of(struct run *r, const struct group *g, long pack, double
     return r->guard;
 }
 
-/* Largest value of guards that can fire or start a timer; which of them is positive first is what is sought. */
-static double alarm(struct run *r, double t, const struct state *x, const struct moment *m)
+/* Largest value of guards that can fire or start a timer, of all units or quick ones alone; which of them is positive
+ * first is what is sought. */
+static double alarm(struct run *r, double t, const struct state *x, const struct moment *m, int quick)
 {
     const struct fleet *f = r->fleet;
     double most = -INFINITY;
     for (long g = 0; g < f->groups; g++) {
         const struct group *group = f->group[g];
-        if (!(group->rows + group->bounds)) continue;
+        if (!(group->rows + group->bounds) || (quick && !group->quick)) continue;
         long lanes = group->lanes;
         for (long pack = 0; pack < group->packs; pack++) {
             const double *value = guards_of(r, group, pack, t, x, m);
@@ -38,10 +39,10 @@ static double alarm(struct run *r, double t, const struct state *x, const struct
     return most;
 }
 
-/* First time in the last step at which an alarm is positive, as a share of the step; g_high is that of its end. */
+/* First time in the last step at which an alarm is positive, as a share of the step; g_high is that at *at. */
 static int locate(struct run *r, double g_high, double *at)
 {
-    double low = 0.0, high = 1.0, g_low = fmin(alarm(r, r->t, &r->now, &r->k[0]), 0.0);
+    double low = 0.0, high = *at, g_low = fmin(alarm(r, r->t, &r->now, &r->k[0], 0), 0.0);
     long d = r->d, ns = r->ns;
     int side = 0, bad = 0;
     if (r->coupled) memcpy(r->here.v, r->k[0].v, r->size_v * sizeof(double));
@@ -54,7 +55,7 @@ static int locate(struct run *r, double g_high, double *at)
         middle = fmin(fmax(middle, low + fmin(least, 0.5 * LOCATED / r->h)), high - fmin(least, 0.5 * LOCATED / r->h));
         inside_at(r, middle);
         bad = voltages(r, r->t + middle * r->h, &r->inside, &r->here, AT_PORTS);
-        double g = alarm(r, r->t + middle * r->h, &r->inside, &r->here);
+        double g = alarm(r, r->t + middle * r->h, &r->inside, &r->here, 0);
         if (g > 0.0) {
             high = middle, g_high = g;
             if (side == 1) g_low *= 0.5;
@@ -263,6 +264,46 @@ static void lapses(struct run *r, double t, const struct state *x, const struct 
         }
     }
     r->timer = next_timer(r);
+}
+
+/* Whether a timer of a quick unit runs that has lost its guard. */
+static int lost_guard(struct run *r, double t, const struct state *x, const struct moment *m)
+{
+    const struct fleet *f = r->fleet;
+    if (!isfinite(r->timer)) return 0;
+    for (long g = 0; g < f->groups; g++) {
+        const struct group *group = f->group[g];
+        for (long pack = 0; group->quick && pack < group->packs; pack++) {
+            const double *value = guards_of(r, group, pack, t, x, m);
+            for (long k = 0; k < group->rows * group->lanes; k++)
+                if (isfinite(group->since[pack * group->rows * group->lanes + k]) && value[k] <= 0.0) return 1;
+        }
+    }
+    return 0;
+}
+
+/* Share of the last step at which it ends for units to be looked at: the first time at which an alarm is positive, or
+ * the end of the first step inside it after which a timer of a facility has lost its guard; 0 where neither is. */
+static int ends_at(struct run *r, double *at)
+{
+    static const int stage_of[LINKS - 1] = {2, 4};
+    double most = 0.0;
+    *at = 0.0;
+    for (int l = 0; r->nested && l + 1 < LINKS && *at == 0.0; l++) {
+        const struct moment *m = &r->k[stage_of[l]];
+        struct state x = {r->link[l].next, 0};
+        double t = r->t + NODE[stage_of[l]] * r->h;
+        if (alarm(r, t, &x, m, 1) <= 0.0 && !lost_guard(r, t, &x, m)) continue;
+        *at = NODE[stage_of[l]];
+        inside_at(r, *at); /* with the machines, and their alarms */
+        if (voltages(r, t, &r->inside, &r->here, AT_PORTS)) return 1;
+        most = alarm(r, t, &r->inside, &r->here, 0);
+    }
+    if (*at == 0.0) {
+        most = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1], 0);
+        if (most > 0.0) *at = 1.0;
+    }
+    return most > 0.0 && locate(r, most, at);
 }
 
 /* Which rotor is further from the centre of inertia than allowed; -1 where none is. */

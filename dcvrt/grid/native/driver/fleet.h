@@ -59,6 +59,7 @@ struct group {
     long ports, v_rows; /* numbers of real parts in currents and in voltages of the whole fleet */
     long first_port, first_feed, first_state; /* states of a group begin at a multiple of BLOCK */
     long reads_v;    /* whether the source depends on the unit's own voltage */
+    long quick;      /* whether it may take steps of its own inside those of the others; such groups are the last */
     long angle;      /* state that is a rotor angle, or -1 */
     double tolerance;          /* of its states, over that of the options */
     const double *p;           /* [pack][np][lane] */
@@ -102,6 +103,7 @@ struct stretch {
 
 struct options {
     double rtol, atol, theta_rtol, theta_share, longest, out_of_step;
+    double worth; /* how many times longer a step has to be with steps of quick units inside it */
     long max_steps;
 };
 

@@ -17,6 +17,12 @@ static int sample(struct run *r, double t, const struct state *x, struct moment 
     return 0;
 }
 
+/* How many times longer the next step may be for this error of the last one. */
+static double growth(const struct run *r, double error)
+{
+    return fmax(0.2, 0.9 * pow(fmax(error, 1e-8), -0.14) * pow(r->error_before, 0.08));
+}
+
 static int stretch_run(struct run *r, const struct stretch *s)
 {
     const struct options *o = r->options;
@@ -24,6 +30,8 @@ static int stretch_run(struct run *r, const struct stretch *s)
     r->network = s->network;
     r->factored = 0;
     r->near = !r->d && !r->coupled && r->options->rtol >= NEAR_FROM;
+    if (r->nests) quick_impedances(r);
+    int nest = r->nests && !(o->worth > 0.0);
     r->t = s->from;
     r->dt_known = 1;
     for (long k = 0; k < r->d; k++) r->dt[k] = s->dfrom ? s->dfrom[k] : 0.0;
@@ -45,8 +53,12 @@ static int stretch_run(struct run *r, const struct stretch *s)
         if (r->h > o->longest) r->h = free_step = o->longest;
         if (r->t + 1.0001 * r->h >= limit) r->h = limit - r->t, cut = 1;
         int bad = 0;
-        for (int k = 1; k < STAGES && !bad; k++) bad = stage(r, k);
-        double error = bad ? INFINITY : error_of(r);
+        r->nested = nest;
+        if (nest) nested_step(r);
+        else
+            for (int k = 1; k < STAGES && !bad; k++) bad = stage(r, k);
+        double of_slow = bad ? INFINITY : error_of(r, 0), of_quick = bad ? INFINITY : error_of(r, 1);
+        double error = fmax(of_slow, of_quick);
         if (!(error <= 1.0)) {
             r->record->rejected++;
             r->h *= isfinite(error) ? fmax(0.2, 0.9 * pow(error, -0.2)) : 0.2;
@@ -54,14 +66,17 @@ static int stretch_run(struct run *r, const struct stretch *s)
             continue;
         }
         r->record->steps++;
-        double grow = 0.9 * pow(fmax(error, 1e-8), -0.14) * pow(r->error_before, 0.08);
+        double base = cut ? fmax(free_step, r->h) : r->h, links = nest ? LINKS : 1.0;
+        double slow_h = fmin(base * growth(r, of_slow), REACH / fastest(r, 0));
+        double quick_h = fmin(base / links * growth(r, of_quick), REACH / fastest(r, 1));
         r->error_before = fmax(error, 1e-4);
-        double next_h = (cut ? fmax(free_step, r->h) : r->h) * fmin(5.0, fmax(0.2, grow));
-        next_h = fmin(next_h, REACH / fastest(r));
-        double end = 1.0;
-        double at_end = alarm(r, r->t + r->h, &r->next, &r->k[STAGES - 1]);
-        int event = at_end > 0.0;
-        if (event && locate(r, at_end, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
+        double most_h = fmin(5.0 * base, slow_h), next_h = fmin(most_h, quick_h);
+        nest = r->nests && fmin(most_h, LINKS * quick_h) > o->worth * next_h;
+        if (nest) next_h = fmin(most_h, LINKS * quick_h);
+        double end;
+        if (ends_at(r, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
+        int event = end > 0.0;
+        if (!event) end = 1.0;
         double until = end == 1.0 ? (cut ? limit : r->t + r->h) : r->t + end * r->h;
         for (; next_sample < s->samples && s->sample[next_sample] < until - SAME_INSTANT; next_sample++) {
             inside_at(r, (s->sample[next_sample] - r->t) / r->h);
@@ -120,6 +135,7 @@ static long count_memory(const struct run *r, long guards, long sensitive)
     long n = 2 * r->coupled;
     return vectors + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
            4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * r->fed_rows + r->fleet->feeds + r->fed_rows + WIDE_BLOCK +
+           (r->nests ? LINKS * (STAGES + 3) * (r->n + 8) + r->quick_rows * (2 * r->fleet->feeds + 2 * (STAGES + 2)) : 0) +
            8 * 128; /* each vector begins on its own cache line */
 }
 
@@ -131,12 +147,19 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     r.rows = f->ports + ((f->points + BLOCK - 1) / BLOCK) * BLOCK;
     r.size_v = 2 * r.rows;
     r.fed_rows = (f->feeds + BLOCK - 1) / BLOCK * BLOCK;
+    r.corner = pow(o->rtol, 0.2) / SMOOTH;
     long guards = 0;
     for (long g = 0; g < f->groups; g++) {
         long all = (f->group[g]->rows + f->group[g]->bounds) * f->group[g]->lanes;
         guards = all > guards ? all : guards;
+        if (f->group[g]->quick) {
+            r.quick_states += (g + 1 < f->groups ? f->group[g + 1]->first_state : r.n) - f->group[g]->first_state;
+            r.quick_feeds += f->group[g]->units;
+        }
         if (f->group[g]->reads_v) r.coupled += f->group[g]->packs * f->group[g]->lanes;
     }
+    r.quick_rows = (r.quick_feeds + BLOCK - 1) / BLOCK * BLOCK;
+    r.nests = r.quick_states && !r.d && !r.coupled;
     long sensitive = r.d > 0 ? r.d : 1;
     long total = count_memory(&r, guards + 8, sensitive);
     if (posix_memalign((void **)&r.memory, 64, total * sizeof(double))) return NO_MEMORY;
@@ -169,6 +192,17 @@ int fleet_run(const struct fleet *f, const struct options *o, long stretches, co
     r.scale = take(&at, r.d), r.fed = take(&at, 8 * f->feeds);
     r.at_feeds = take(&at, 8 * r.fed_rows);
     r.fed_change = (float *)take(&at, f->feeds), r.change = (float *)take(&at, r.fed_rows + WIDE_BLOCK);
+    if (r.nests) {
+        for (int l = 0; l < LINKS; l++) { /* a link ends where the next one begins */
+            struct span *link = &r.link[l];
+            link->x = l ? r.link[l - 1].next : take(&at, r.n);
+            link->next = take(&at, r.n), link->before = take(&at, r.n);
+            for (int j = 0; j < STAGES; j++) link->f[j] = take(&at, r.n);
+        }
+        r.z_quick = take(&at, 2 * r.quick_rows * f->feeds);
+        r.driven = take(&at, 2 * (STAGES + 2) * r.quick_rows);
+        all_drive_weights(&r);
+    }
     memcpy(r.now.x, x, r.n * sizeof(double));
     if (r.d) memcpy(r.now.xs, xs, r.ns * sizeof(double));
     for (long p = 0; p < r.ports; p++) {

@@ -23,6 +23,14 @@ struct moment {
     double *f, *fs, *s, *ss, *v, *vs;
 };
 
+/* One step of the pair: states at its begin, its end and the stage before its end, rates of its stages. */
+struct span {
+    double h;
+    double *x, *next, *before, *f[STAGES];
+};
+
+enum { LINKS = 3 }; /* steps of facilities inside one of machines, end to end */
+
 struct run {
     const struct fleet *fleet;
     const struct options *options;
@@ -33,9 +41,16 @@ struct run {
     long fed_rows;                      /* rows of Z of the ports that feed, in whole blocks */
     int near;                           /* whether voltages of stages are found near those of the step's begin */
     double t, h, error_before;
+    double corner;           /* part of an error that the last term is */
     double timer;            /* when the next timer runs out */
     struct state now, next, stage, inside;
     struct moment k[STAGES], here, there;
+    int nests, nested;       /* whether facilities may, and in the last step did, take steps of their own */
+    long quick_states, quick_feeds, quick_rows; /* of units that may: they are the last ones; rows in whole blocks */
+    struct span link[LINKS];
+    double *z_quick;         /* rows of Z of their ports */
+    double *driven;          /* [stage][re, im][row]: what the others drive these ports by; then room */
+    double drive_weight[STAGES][STAGES][STAGES]; /* [last stage known][stage of a link][stage] */
     double *guard, *guards;  /* of one pack */
     double *by_v, *matrix, *right, *trial, *pack;
     double *fed;             /* [re, im][feed] of each set: source currents as a product takes them */
