@@ -81,7 +81,7 @@ static void add_driven(const struct run *r, const double *s, int quick, double *
     const struct fleet *f = r->fleet;
     for (long b = 0; b < r->quick_rows; b += BLOCK) {
         block *real = (block *)(u + b), *imaginary = (block *)(u + r->quick_rows + b);
-        block re = *real, im = *imaginary;
+        block re = *real, im = *imaginary, re_too = {0}, im_too = {0}; /* a sum waits for the one before it */
         for (long g = 0; g < f->groups; g++) {
             const struct group *group = f->group[g];
             if (group->quick != quick) continue;
@@ -90,9 +90,10 @@ static void add_driven(const struct run *r, const double *s, int quick, double *
             for (long j = 0; j < group->units; j++, z += 2 * BLOCK) {
                 block zr = *(const block *)z, zi = *(const block *)(z + BLOCK);
                 re += zr * own[j], im += zr * own[r->ports + j];
-                re -= zi * own[r->ports + j], im += zi * own[j];
+                re_too -= zi * own[r->ports + j], im_too += zi * own[j];
             }
         }
+        re += re_too, im += im_too;
         *real = re, *imaginary = im;
     }
 }
