@@ -83,7 +83,8 @@ class OptionsStruct(Structure):
     """struct options."""
 
     _fields_ = (
-        *((n, c_double) for n in ("rtol", "atol", "theta_rtol", "theta_share", "longest", "out_of_step", "worth")),
+        *((n, c_double) for n in ("rtol", "atol", "theta_rtol", "theta_share")),
+        *((n, c_double) for n in ("longest", "out_of_step", "worth")),
         ("max_steps", c_long),
     )  # fmt: skip
 
@@ -137,8 +138,8 @@ def compiler() -> Compiler:
 def network_library() -> ctypes.CDLL:
     """The object that integrates a fleet."""
     found = compiler()
-    headers = ("fleet.h", "pair.h", "rk54.h", "run.h", "products.h", "voltages.h", "steps.h", "nested.h", "events.h")
-    files = _files(*headers, "network.c")
+    base = ("fleet.h", "pair.h", "rk54.h", "run.h", "products.h", "voltages.h")
+    files = _files(*base, "steps.h", "nested.h", "events.h", "network.c")
     path = build(files, found, (*FLAGS, *native_flags(found), *QUIET), ("network.c",))
     dll = ctypes.CDLL(str(path))
     dll.fleet_run.argtypes = [

@@ -11,16 +11,17 @@
  *     2/9 = 0 + 2/3 . 1/3,   1/3 = end of the first,   5/9 = 1/3 + 2/3 . 1/3,   2/3 = end of the second,   1,
  *
  * so that links and step are interleaved: the machines' stage k is moved first, u(t) becomes the polynomial that meets
- * u_0, its slope there and the u of all stages known, the links go on to c_k, and s_F goes from there into the machines'
- * rates. In stage 1 all states lie on the tangent, as in the pair; u_1 gives the slope, and the first link is made once
- * u_2 is known. On a link, the states at 2/3 are those of Simpson's rule and those at the end, before the last u is
+ * u_0, its slope there and the u of all stages known, the links go on to c_k, and s_F goes from there into the rates of
+ * the machines. In stage 1 all states lie on the tangent, as in the pair; u_1 gives the slope, and the first link is made
+ * once u_2 is known. On a link, the states at 2/3 are those of Simpson's rule and those at the end, before the last u is
  * known, those of the pair: the states of its stages themselves err too much where a lag is stiff.
  *
  * Where facilities follow u at once, each stage has the s_F of its own u, and the order is that of the pair. What they
  * remember of u on the way has errors of order 3, small by the impedances between M and F; it differs from stage to
  * stage, so that the estimate of the machines' step sees it, and refuses or shortens the step.
  *
- * Only machines whose sources depend on states alone, and runs without derivatives, are stepped so.
+ * A step is made so where it may be `worth` times as long as one of all units: no machine's source may depend on its
+ * voltage, and no derivatives are carried.
  */
 #ifndef DCVRT_NESTED_H
 #define DCVRT_NESTED_H
@@ -120,7 +121,8 @@ static void quick_rates(struct run *r, double t, const double *x, const double *
         for (int part = 0; part < 2; part++) {
             const double *row = v + part * r->quick_rows + group->first_feed - first;
             double *own = m->v + part * r->rows + group->first_port;
-            for (long i = 0; i < group->packs * group->lanes; i++) own[i] = row[i < group->units ? i : group->units - 1];
+            for (long i = 0; i < group->packs * group->lanes; i++)
+                own[i] = row[i < group->units ? i : group->units - 1];
         }
         group->call->flow(group, 0, t, x, 0, m->v, 0, f, 0);
     }

@@ -133,9 +133,10 @@ static long count_memory(const struct run *r, long guards, long sensitive)
 {
     long vectors = 4 * (r->n + r->ns) + (STAGES + 2) * (r->n + r->ns + (1 + r->d) * (2 * r->ports + r->size_v));
     long n = 2 * r->coupled;
+    long links = LINKS * (STAGES + 3) * (r->n + 8) + 2 * r->quick_rows * (r->fleet->feeds + STAGES + 2);
     return vectors + guards * (1 + sensitive) + 2 * n + n * n + n + r->size_v +
            4 * r->ports + r->d + 8 * r->fleet->feeds + 8 * r->fed_rows + r->fleet->feeds + r->fed_rows + WIDE_BLOCK +
-           (r->nests ? LINKS * (STAGES + 3) * (r->n + 8) + r->quick_rows * (2 * r->fleet->feeds + 2 * (STAGES + 2)) : 0) +
+           (r->nests ? links : 0) +
            8 * 128; /* each vector begins on its own cache line */
 }
 

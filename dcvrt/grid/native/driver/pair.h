@@ -13,8 +13,8 @@
  * whose rounding is 1e-7 of the difference. From a tolerance of NEAR_FROM on, that is far below it. The voltages with
  * which the next step begins are always in double precision, so that rounding does not add up.
  *
- * A step of facilities inside one of machines (nested.h) may err LINK_TOLERANCE times as much as one with them: what errs
- * are lags that follow the voltage, and the next such step leaves little of it.
+ * Steps of facilities inside one of machines (nested.h) may err LINK_TOLERANCE times as much as one of all units: what
+ * errs are lags that follow the voltage, and the next such step leaves little of it.
  */
 #ifndef DCVRT_PAIR_H
 #define DCVRT_PAIR_H
@@ -25,6 +25,6 @@
 #define STILL 0.03
 #define SMOOTH 24.0
 #define NEAR_FROM 5e-7
-#define LINK_TOLERANCE 4.0
+#define LINK_TOLERANCE 2.0
 
 #endif
