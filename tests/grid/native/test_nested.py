@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from importlib import resources
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_fewer_steps_where_lags_bound_them(grid: Grid) -> None:
     stages = BusFault(22).stages(grid.network)
     times = sample_times(stages, 5.0, 1 / 120)
     nested, joint = (point.simulate(stages, times, Options(worth=w)) for w in (1.5, np.inf))
-    assert nested.steps < 0.75 * joint.steps
+    assert nested.steps < 0.8 * joint.steps
 
 
 @pytest.mark.parametrize("x_f", np.geomspace(0.05, 1.0, 8).round(3).tolist())
@@ -153,7 +154,7 @@ def test_a_strong_coupling_shortens_the_step() -> None:
 
 def test_without_facilities_and_with_derivatives_it_changes_nothing() -> None:
     of = small()
-    given = [
+    given: list[dict[str, Any]] = [
         dict(fault=MILD, until=0.5),
         dict(fault=MILD, until=0.5, facilities={3: facility.gfl()}, wrt=("H_3",)),
         dict(fault=MILD, until=0.5, facilities={3: facility.get("no-ups")}),

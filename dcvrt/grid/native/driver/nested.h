@@ -20,7 +20,7 @@
  * remember of u on the way has errors of order 3, small by the impedances between M and F; it differs from stage to
  * stage, so that the estimate of the machines' step sees it, and refuses or shortens the step.
  *
- * A step is made so where it may be `worth` times as long as one of all units: no machine's source may depend on its
+ * A step is made so where machines move and it may be `worth` times as long as one of all units: no machine's source may depend on its
  * voltage, and no derivatives are carried.
  */
 #ifndef DCVRT_NESTED_H

@@ -71,8 +71,9 @@ static int stretch_run(struct run *r, const struct stretch *s)
         double quick_h = fmin(base / links * growth(r, of_quick), REACH / fastest(r, 1));
         r->error_before = fmax(error, 1e-4);
         double most_h = fmin(5.0 * base, slow_h), next_h = fmin(most_h, quick_h);
-        nest = r->nests && fmin(most_h, LINKS * quick_h) > o->worth * next_h;
-        if (nest) next_h = fmin(most_h, LINKS * quick_h);
+        double nested_h = fmin(most_h, LINKS * quick_h), moves = of_slow * pow(nested_h / r->h, 5.0);
+        nest = r->nests && (!(o->worth > 0.0) || (nested_h > o->worth * next_h && moves > MOVING));
+        if (nest) next_h = nested_h;
         double end;
         if (ends_at(r, &end)) return failed(r, NO_VOLTAGE, r->t, 0, 0, 0, 0);
         int event = end > 0.0;

@@ -14,7 +14,8 @@
  * which the next step begins are always in double precision, so that rounding does not add up.
  *
  * Steps of facilities inside one of machines (nested.h) may err LINK_TOLERANCE times as much as one of all units: what
- * errs are lags that follow the voltage, and the next such step leaves little of it.
+ * errs are lags that follow the voltage, and the next such step leaves little of it. They are taken while machines move,
+ * so that a step of theirs would err by MOVING of the tolerance: at rest, lags that are not quite still would push them.
  */
 #ifndef DCVRT_PAIR_H
 #define DCVRT_PAIR_H
@@ -26,5 +27,6 @@
 #define SMOOTH 24.0
 #define NEAR_FROM 5e-7
 #define LINK_TOLERANCE 2.0
+#define MOVING 3e-3
 
 #endif
