@@ -39,7 +39,7 @@ def assert_alike(one: dict[Fault, FaultRun], other: dict[Fault, FaultRun]) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*CASES, *(set(FURTHER) - {"frequency"})])
+@pytest.mark.parametrize("name", [*CASES, *(name for name in FURTHER if name != "frequency")])
 def test_every_case_together_and_one_by_one(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path, dynamics = (CASES | FURTHER)[name]
     case = Grid.from_case(
