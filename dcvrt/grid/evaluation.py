@@ -77,7 +77,7 @@ class Jacobian:
 
     def __init__(self, system: Any) -> None:
         self.system, self.models = system, system.exist.pflow_tds
-        n, m = int(system.dae.n), int(system.dae.m)
+        n = int(system.dae.n)
         rows, columns, self._constant = [], [], []
         for block in BLOCKS:
             first_row, first_column = n * (block[0] == "g"), n * (block[1] == "y")
@@ -86,14 +86,14 @@ class Jacobian:
             places = [(constant.I, constant.J), *((i, j) for i, j, _ in self._of_models(block))]
             rows += [np.ravel(i).astype(np.int64) + first_row for i, _ in places]
             columns += [np.ravel(j).astype(np.int64) + first_column for _, j in places]
-        every = np.arange(n + m)
-        self.row, self.column = np.concatenate([*rows, every]), np.concatenate([*columns, every])
-        self._diagonal = np.zeros(n + m)
-        self._islanded = np.zeros(0, dtype=np.int64)
-        if system.Bus.n_islanded_buses:  # rows of their own, as in `System.j_islands`
+        alone = np.zeros(
+            0, dtype=np.int64
+        )  # buses without a line keep their voltage, as in `System.j_islands`
+        if system.Bus.n_islanded_buses:
             alone = n + np.concatenate([system.Bus.islanded_a, system.Bus.islanded_v]).astype(np.int64)
-            self._islanded = np.flatnonzero(np.isin(self.row, alone))
-            self._diagonal[alone] = system.config.diag_eps
+        self._islanded = np.flatnonzero(np.isin(np.concatenate(rows), alone))
+        self._kept = np.full(len(alone), system.config.diag_eps)
+        self.row, self.column = np.concatenate([*rows, alone]), np.concatenate([*columns, alone])
         self._own = np.flatnonzero((self.row == self.column) & (self.row < n))
 
     def _of_models(self, block: str) -> Iterator[tuple[Any, Any, Any]]:
@@ -106,8 +106,8 @@ class Jacobian:
         parts = []
         for block, constant in zip(BLOCKS, self._constant, strict=True):
             parts += [constant, *(np.ravel(values) for _, _, values in self._of_models(block))]
-        values = np.concatenate([*parts, self._diagonal])
-        values[self._islanded[self._islanded < len(values) - len(self._diagonal)]] = 0.0
+        values = np.concatenate([*parts, self._kept])
+        values[self._islanded] = 0.0
         return values
 
     def own_rates(self, values: Floats) -> Floats:

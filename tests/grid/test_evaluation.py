@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from kvxopt import matrix
 
+from dcvrt.grid import andes
 from dcvrt.grid.evaluation import BLOCKS, Evaluation, Jacobian
-from tests.grid.live import CASES, FURTHER, fresh
+from tests.grid.live import CASES, FURTHER, fresh, package
 
 COMES_BACK = ("ieee39", "exst1")
 """Cases whose limited states are pulled back from beyond a limit, so that no limiter has to hold them."""
@@ -53,9 +54,22 @@ def test_equations_are_those_of_andes_wherever_the_states_are(case: str) -> None
     assert pegged > 0 or case in COMES_BACK
 
 
-@pytest.mark.parametrize("case", ["ieee118", *CASES, *FURTHER])
+def with_a_bus_alone() -> Any:
+    """A case with a bus that no line joins."""
+    system = andes.read(package() / CASES["kundur"][0])
+    with andes.quiet():
+        system.add("Bus", {"idx": 99, "Vn": 230.0})
+        system.setup()
+        system.PFlow.run()
+        system.TDS.config.no_tqdm = 1
+        system.TDS.init()
+    assert system.Bus.n_islanded_buses == 1
+    return system
+
+
+@pytest.mark.parametrize("case", ["ieee118", *CASES, *FURTHER, "a bus alone"])
 def test_the_jacobian_is_that_of_andes(case: str) -> None:
-    system = fresh(case)
+    system = with_a_bus_alone() if case == "a bus alone" else fresh(case)
     jacobian, dae, rng = Jacobian(system), system.dae, np.random.default_rng(3)
     x0, y0, n, m = dae.x.copy(), dae.y.copy(), int(dae.n), int(dae.m)
     for size in (0.0, 0.02):
