@@ -287,8 +287,8 @@ def read_network(path: Path, dynamics: Path | None, name: str) -> Network:
     )
 
 
-def branches_of(network: Network) -> Network:
-    """The network with branches as ANDES has them: it adds 1e-8 pu to every resistance and reactance.
+def as_evaluated(network: Network) -> Network:
+    """The network as ANDES evaluates it, which adds 1e-8 pu to every resistance and reactance.
 
     One engine simulates a grid and the other replays it. The addition moves voltages by 1e-7 pu, and states
     of small machines by more; with it in both they solve the same equations.

@@ -149,7 +149,7 @@ class Grid:
     def network(self) -> Network:
         """Buses, branches and units, as both engines have them."""
         read = Network.ieee118() if self.rule else andes.read_network(self.path, self.dynamics, self.name)
-        return andes.branches_of(read)
+        return andes.as_evaluated(read)
 
     def __getstate__(self) -> dict[str, object]:
         return {
