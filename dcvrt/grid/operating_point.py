@@ -311,6 +311,8 @@ class OperatingPoint:
             for run in runs:
                 run.record()
         for number, stretch in enumerate(times[1:], start=1):
+            if not stepper.active:
+                break
             stepper.t = float(stretch[0])
             guess = system.dae.y.copy()
             for copy in stepper.active:
@@ -320,6 +322,8 @@ class OperatingPoint:
                 if not runs[copy].recovered():
                     stepper.active.remove(copy)
             for t in stretch:
+                if not stepper.active:
+                    break
                 if t > stretch[0]:
                     stepper.advance(float(t))
                 for copy in list(stepper.active):

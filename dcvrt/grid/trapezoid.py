@@ -267,11 +267,11 @@ class _Newton:
 
     def correct(self, residual: Floats) -> bool:
         """Make one iteration, from the residuals of all states; false where it gives no numbers."""
+        if self._factors is None:
+            return False
         own = residual[self.x]
         own[self.still] = 0.0
         right = self._kvxopt.matrix(np.concatenate((own, self.dae.g[self.y])))
-        if self._factors is None:
-            return False
         self._klu.solve(self._matrix, self._symbolic, self._factors, right)
         step = np.ravel(right)
         if not np.isfinite(step).all():

@@ -20,8 +20,8 @@
  * remember of u on the way has errors of order 3, small by the impedances between M and F; it differs from stage to
  * stage, so that the estimate of the machines' step sees it, and refuses or shortens the step.
  *
- * A step is made so where machines move and it may be `worth` times as long as one of all units: no machine's source may depend on its
- * voltage, and no derivatives are carried.
+ * A step is made so while machines move, where it may be `worth` times as long as one of all units. It needs sources of
+ * machines that do not depend on their voltage, and carries no derivatives.
  */
 #ifndef DCVRT_NESTED_H
 #define DCVRT_NESTED_H
